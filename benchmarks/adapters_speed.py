@@ -1,12 +1,12 @@
 """How fast is each adapter, compared with the bare environment?
 
 `python -m benchmarks.adapters_speed [who=bare,gymnasium,...] [stage=s1] [arenas=256] [steps=200]`
-prints a JSON line for each adapter. It times five calls of `steps` control steps each, after one
-warm-up call, with all robots driving straight ahead. `compile_s` is the first call minus the median
-of the others. `pettingzoo` steps one arena, from the host. `jaxmarl` and `playground` map the step
-of one arena over `arenas` arenas. Adapters that run on the device take all steps in one `scan`. The
-others take one step after the other on the host. An adapter whose library is missing is left out,
-and the reason is printed.
+prints a JSON line for each adapter. The command times five calls of `steps` control steps each,
+after one warm-up call, with all robots driving straight ahead. `compile_s` is the time of the first
+call minus the median time of the later calls. `pettingzoo` steps a single arena in a loop on the
+host. `jaxmarl` and `playground` map the step of one arena over `arenas` arenas. Adapters that run
+on the device take all steps in one `scan`. The other adapters take their steps in a loop on the
+host. An adapter whose library is missing is left out, and the reason is printed.
 """
 
 import statistics
@@ -30,7 +30,7 @@ Call = Callable[[], Any]
 
 @dataclass(frozen=True, kw_only=True)
 class AdapterSpeedConfig(Section):
-    """Settings: what to measure, and for how long."""
+    """Settings: which adapters to time, on which stage, and how many arenas and steps."""
 
     who: tuple[str, ...] = field(
         default=(
@@ -51,7 +51,10 @@ class AdapterSpeedConfig(Section):
 
 
 def _scan(reset: Callable[[Any], Any], step: Callable[[Any], Any], key: Any, steps: int) -> Call:
-    """Loops on the device; each call continues where the last one ended."""
+    """Makes a call that takes all steps in one `scan` on the device.
+
+    Each call continues from the state in which the previous call ended.
+    """
     held = [jax.jit(reset)(key)]
     many = jax.jit(lambda state: jax.lax.scan(lambda s, _: (step(s), None), state, length=steps)[0])
 
@@ -62,7 +65,7 @@ def _scan(reset: Callable[[Any], Any], step: Callable[[Any], Any], key: Any, ste
 
 
 def _repeat(step: Callable[[], Any], steps: int) -> Call:
-    """Loops on the host."""
+    """Makes a call that takes all steps in a loop on the host."""
 
     def call() -> None:
         for _ in range(steps):
@@ -76,14 +79,14 @@ def _straight(*shape: int) -> Any:
 
 
 def bare(given: AdapterSpeedConfig) -> Call:
-    """The environment itself."""
+    """Makes the call for the bare environment."""
     swarm = swarmjax.make_env(given.stage, arenas=given.arenas)
     action = jnp.asarray(_straight(given.arenas, swarm.num_robots))
     return _scan(swarm.reset, lambda s: swarm.step(s, action)[0], jax.random.key(0), given.steps)
 
 
 def gymnasium(given: AdapterSpeedConfig) -> Call:
-    """Gymnasium's vector environment."""
+    """Makes the call for Gymnasium's vector environment."""
     adapter = peers.find("swarmjax.adapters.gymnasium", "the extra gymnasium")
     env = adapter.SwarmVectorEnv(swarmjax.make_env(given.stage, arenas=given.arenas))
     env.reset(seed=0)
@@ -92,7 +95,7 @@ def gymnasium(given: AdapterSpeedConfig) -> Call:
 
 
 def sb3(given: AdapterSpeedConfig) -> Call:
-    """That of Stable-Baselines3."""
+    """Makes the call for Stable-Baselines3's vector environment."""
     adapter = peers.find("swarmjax.adapters.sb3", "the extra sb3")
     env = adapter.SwarmVecEnv(swarmjax.make_env(given.stage, arenas=given.arenas))
     env.reset()
@@ -101,7 +104,7 @@ def sb3(given: AdapterSpeedConfig) -> Call:
 
 
 def pettingzoo(given: AdapterSpeedConfig) -> Call:
-    """Steps one arena, and resets it when no robot is left."""
+    """Makes the call for one PettingZoo arena, which is reset when no robot is left."""
     adapter = peers.find("swarmjax.adapters.pettingzoo", "the extra pettingzoo")
     env = adapter.SwarmParallelEnv(swarmjax.make_env(given.stage, arenas=1))
     action = _straight(1)[0]
@@ -115,7 +118,7 @@ def pettingzoo(given: AdapterSpeedConfig) -> Call:
 
 
 def jaxmarl(given: AdapterSpeedConfig) -> Call:
-    """One arena, mapped."""
+    """Makes the call for JaxMARL: the step of one arena, mapped over `arenas` arenas."""
     adapter = peers.find("swarmjax.adapters.jaxmarl", "the extra jaxmarl")
     env = adapter.SwarmMultiAgentEnv(swarmjax.make_env(given.stage, arenas=1))
     keys = jax.random.split(jax.random.key(0), given.arenas)
@@ -127,7 +130,7 @@ def jaxmarl(given: AdapterSpeedConfig) -> Call:
 
 
 def brax(given: AdapterSpeedConfig) -> Call:
-    """Steps Brax's environment with all robots."""
+    """Makes the call for Brax, where each robot is one environment."""
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
     env = adapter.SwarmBraxEnv(swarmjax.make_env(given.stage, arenas=given.arenas))
     keys, told = jax.random.split(jax.random.key(0), env.num_envs), _straight(env.num_envs)
@@ -135,7 +138,10 @@ def brax(given: AdapterSpeedConfig) -> Call:
 
 
 def playground(given: AdapterSpeedConfig) -> Call:
-    """Maps the step of one arena over `arenas` arenas, without Playground's wrappers."""
+    """Makes the call for Playground, without its wrappers.
+
+    The call maps the step of one arena over `arenas` arenas.
+    """
     adapter = peers.find("swarmjax.adapters.playground", "the extra playground")
     env = adapter.SwarmMjxEnv(swarmjax.make_env(given.stage, arenas=1))
     keys = jax.random.split(jax.random.PRNGKey(0), given.arenas)
@@ -145,7 +151,7 @@ def playground(given: AdapterSpeedConfig) -> Call:
 
 
 def torch(given: AdapterSpeedConfig) -> Call:
-    """PyTorch's tensors."""
+    """Makes the call for the adapter that exchanges PyTorch tensors."""
     library = peers.find("torch", "the extra torch")
     adapter = peers.find("swarmjax.adapters.torch", "the extra torch")
     env = adapter.SwarmTorchEnv(swarmjax.make_env(given.stage, arenas=given.arenas))

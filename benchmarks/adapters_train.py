@@ -1,11 +1,12 @@
-"""Do other libraries train the swarm through their adapters?
+"""Can other libraries train the swarm through their adapters?
 
 `python -m benchmarks.adapters_train who=brax|sb3|torch [seed=0] [arenas=64] [budget=3000000]`
-trains `s1` with the PPO of Brax, of Stable-Baselines3 or of examples/torch_ppo.py until 0.9 of the
-targets are reached, and prints a JSON line. The seconds in this line are training time without
-compiling. Brax's evaluator judges the policy's mean action on one episode of each robot. For the
-other two libraries the share is measured over the last 200 robots of training, while the policy
-still explores. The command needs the extra with the library's name.
+trains stage `s1` with the PPO of Brax, of Stable-Baselines3 or of examples/torch_ppo.py until 0.9
+of the targets are reached, and prints a JSON line. The seconds in this line are training time
+without compilation. Brax's evaluator judges the policy's mean action on one episode of each robot.
+For the other two libraries the share of targets is measured over the last 200 robots whose episodes
+ended in training, while the policy still explores. The command needs the extra with the library's
+name.
 """
 
 import contextlib
@@ -29,7 +30,7 @@ TARGET, RECENT = 0.9, 200
 
 @dataclass(frozen=True, kw_only=True)
 class AdapterTrainConfig(Section):
-    """Settings: which library trains, and how much."""
+    """Settings: which library trains, and for how many robot steps at most."""
 
     who: Literal["brax", "sb3", "torch"] = field(default="brax", metadata=about("trains"))
     seed: int = field(default=0, metadata=about("random seed", 0, 2**31 - 1))
@@ -38,14 +39,14 @@ class AdapterTrainConfig(Section):
 
 
 class _Reached(Exception):  # noqa: N818  # not an error: training is over
-    """Raised when the share of targets is reached."""
+    """Raised when the robots reach at least the share `TARGET` of their targets."""
 
 
 def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
     """Trains with Brax's PPO.
 
     Returns:
-      The share of targets reached, robot steps, and seconds.
+      The share of targets reached, the number of robot steps, and the training time in seconds.
     """
     ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
@@ -83,14 +84,15 @@ def train_brax(given: AdapterTrainConfig) -> tuple[float, int, float]:
             seed=given.seed,
         )
     share, steps, _ = curve[-1]
-    # The first calls also compile, so each of them is counted with the median time of the others.
+    # The first two calls also compile. Each of them therefore counts with the median time of the
+    # later calls, or with the shortest time of all calls if there are no later calls.
     calls = np.diff([seconds for *_, seconds in curve])
     calls[:2] = np.median(calls[2:]) if len(calls) > 2 else calls.min()
     return share, steps, float(calls.sum())
 
 
 def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
-    """Trains with Stable-Baselines3's PPO; returns the same as `train_brax`."""
+    """Trains with Stable-Baselines3's PPO; returns the same three numbers as `train_brax`."""
     library = peers.find("stable_baselines3", "the extra sb3")
     callbacks = peers.find("stable_baselines3.common.callbacks", "the extra sb3")
     adapter = peers.find("swarmjax.adapters.sb3", "the extra sb3")
@@ -98,7 +100,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
     env.reset()
     env.step(np.zeros((env.num_envs, 2), np.float32))
     recent: list[bool] = []
-    peers.find("torch", "the extra sb3").set_num_threads(1)  # more are slower next to JAX's
+    peers.find("torch", "the extra sb3").set_num_threads(1)  # more threads are slower beside JAX's
 
     def look(values: dict[str, Any], _: Any) -> bool:
         ended = [info for info in values["infos"] if info]
@@ -123,7 +125,7 @@ def train_sb3(given: AdapterTrainConfig) -> tuple[float, int, float]:
 
 
 def train_torch(given: AdapterTrainConfig) -> tuple[float, int, float]:
-    """Trains with examples/torch_ppo.py; returns the same as `train_brax`."""
+    """Trains with examples/torch_ppo.py; returns the same three numbers as `train_brax`."""
     peers.find("torch", "the extra torch")
     path = Path(__file__).parents[1] / "examples" / "torch_ppo.py"
     spec = importlib.util.spec_from_file_location("torch_ppo", path)

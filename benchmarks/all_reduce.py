@@ -1,8 +1,8 @@
 """How long does a sum over devices take?
 
 `python -m benchmarks.all_reduce devices=N [sizes=1,1024,16384,1048576]` sums float32 arrays over
-the first N devices. One program runs many sums in sequence. For each size a JSON line is printed
-with the microseconds per sum, as the median of `REPEATS` calls.
+the first N devices. One compiled program runs `SUMS` sums in sequence. For each size the command
+prints a JSON line with the microseconds per sum, which is the median over `REPEATS` calls.
 """
 
 import json
@@ -24,13 +24,13 @@ from swarmjax.config import Section, about
 from swarmjax.shards import AXIS
 from swarmjax.training import mesh
 
-SUMS = 200  # per call
+SUMS = 200  # sums per call
 REPEATS = 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class AllReduceConfig(Section):
-    """What is summed."""
+    """Settings: the number of devices, and the sizes of the arrays to sum."""
 
     devices: int = field(default=2, metadata=about("that sum", 2, 2**16))
     sizes: tuple[int, ...] = field(
@@ -39,7 +39,7 @@ class AllReduceConfig(Section):
 
 
 def seconds(devices: int, size: int) -> float:
-    """Times a sum.
+    """Times the sum of an array over devices.
 
     Args:
       devices: number of devices.

@@ -1,12 +1,14 @@
-"""What do controllers without learning reach on the same levels in the same engine?
+"""How good are controllers without learning, on the levels and in the engine of `evaluate`?
 
-`python -m benchmarks.baselines suite=NAME [who=straight,bug2,orca] [evaluate keys]`, or
-`stage=NAME`, judges each controller in MuJoCo C and prints a JSON line for each cell:
+`python -m benchmarks.baselines suite=NAME [who=straight,bug2,orca] [evaluate keys]` judges each
+controller in MuJoCo C and prints a JSON line for each controller and cell. `stage=NAME` may replace
+`suite=NAME`. The controllers are:
 
-- `straight` drives straight to its target and ignores the infrared. `still` never moves.
-- `bug2` follows outlines, from a robot's ten observations and a memory (`benchmarks.bug2`).
-- `orca`, `hrvo`, `hl` and `social_force` know all positions and the map (`benchmarks.planners`).
-  They need the extra `navground`.
+- `straight` drives straight to the target and ignores the infrared sensors. `still` never moves.
+- `bug2` follows the outlines of obstacles. It uses a robot's ten observations and a memory
+  (`benchmarks.bug2`).
+- `orca`, `hrvo`, `hl` and `social_force` use the positions of all robots and the map
+  (`benchmarks.planners`). These four need the extra `navground`.
 """
 
 import math
@@ -36,26 +38,27 @@ from swarmjax.task import observation
 from swarmjax.task.level import Level
 from swarmjax.task.stage_files import load_levels
 
-# Action (speed, turn rate; -1..1) at bearing 0, and what each radian to the left or right adds. The
-# turn is twice the bearing. The speed is full at bearing 0 and falls with the bearing.
+# The action (speed, turn rate; -1..1) at bearing 0, then the change of the action per radian of
+# bearing to the left, and per radian to the right. In `straight` the turn rate is twice the
+# bearing, and the speed is full at bearing 0 and falls with the bearing.
 POLICIES = {
     "straight": ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0)),
     "still": ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
 }
 NAMES = (*POLICIES, "bug2", *planners.SETTINGS)
-BATCH = 32  # arenas that a process runs at once; with 40 robots on 4 x 4 m their paths fill 0.2 GB
+BATCH = 32  # arenas per process at once; with 40 robots on 4 x 4 m the planned paths take 0.2 GB
 _FIXED = (
     "policy",
     "compare",
     "engine",
     "action",
     "out",
-)  # keys of `evaluate` that mean nothing here
+)  # keys of `evaluate` that baselines reject
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinesConfig(Section):
-    """Who is judged."""
+    """Settings: which baselines are judged."""
 
     who: tuple[str, ...] = field(
         default=("straight", "still", "bug2"), metadata=about("baselines, one after the other")
@@ -83,7 +86,7 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
     Args:
       path: path of the `policy.npz`.
       ahead: [2] action at bearing 0.
-      sides: change of the action [2] per radian to the left, and per radian to the right.
+      sides: change of the action [2] per radian of bearing to the left, and to the right.
     """
     split = np.zeros((1, observation.SIZE, 2), np.float32)
     split[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
@@ -161,7 +164,7 @@ def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, 
 def _read(who: Sequence[str], arguments: Sequence[str]) -> tuple[EvaluateConfig, dict[str, Policy]]:
     """Reads the settings, and the policy with which each baseline is judged.
 
-    For a baseline that is no policy, the file only sets the range of commands.
+    For a baseline that is not a policy, the file only gives the range of commands.
     """
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -193,7 +196,7 @@ def _simulate(job: _Batch) -> tuple[Outcome, float]:
 
 
 def controller(who: str, judge: Judge) -> Controller | None:
-    """Makes the controller of a baseline; None for a baseline that is only a policy."""
+    """Makes the controller of a baseline; returns None for a baseline that is only a policy."""
     if who in POLICIES:
         return None
     return bug2.load(judge) if who == "bug2" else planners.load(who, judge)
@@ -202,7 +205,7 @@ def controller(who: str, judge: Judge) -> Controller | None:
 def _line(
     settings: EvaluateConfig, suite: str | None, who: str, cell: Cell, outcome: Outcome
 ) -> dict[str, Any]:
-    """Writes a baseline's results on a cell as plain data for JSON."""
+    """Returns a baseline's results on a cell as plain data for JSON."""
     step, mine = settings.task.control_step, trials.specialise(settings, cell, settings.policy)
     found = measures.per_level(outcome, step, mine.step_limit)
     packages = ("navground", "scipy") if who in planners.SETTINGS else ()

@@ -1,12 +1,14 @@
 """How far does a robot turn while a wall blocks it and its wheels slip?
 
 `python -m benchmarks.blocked` presses one robot against a wall for `SECONDS` at constant wheel
-speeds, and prints a JSON line for each start and body, with how far the robot turned and slid.
+speeds. It prints a JSON line for each start and body. The line has the angle by which the robot
+turned, and the distance by which it slid.
 
-It runs both bodies in MuJoCo C, and also integrates a reference by hand. The reference is a rigid
-disc on two wheels with Coulomb friction, against a frictionless wall. In the reference both wheels
-push forward with all their grip at any speed, so no grip is left to turn the robot. A body that
-turns freely while blocked is therefore wrong.
+The command simulates both bodies in MuJoCo C. It also integrates the motion of a reference robot,
+without MuJoCo. The reference robot is a rigid disc on two wheels with Coulomb friction, pressed
+against a frictionless wall. Both wheels of the reference use all their grip to push forward, at any
+speed, so no grip is left to turn the robot. A body that turns freely while blocked is therefore
+wrong.
 """
 
 import json
@@ -22,8 +24,8 @@ from swarmjax.config import ConfigError, Section
 from swarmjax.sim.config import RobotConfig
 
 SECONDS = 2.0
-GAP = 0.001  # m; between hull and wall at the start
-# Left and right wheel speed (rad/s), and heading relative to the wall's normal (rad).
+GAP = 0.001  # m; distance between hull and wall at the start
+# For each start: left and right wheel speed (rad/s), and heading from the wall's normal (rad).
 STARTS = (
     (6.28, 0.7, -0.49),
     (6.28, 0.7, 0.49),
@@ -31,7 +33,7 @@ STARTS = (
     (6.28, 3.0, 0.2),
     (6.28, 0.7, 0.0),
 )
-# Bodies with their physics steps (s): those of training and of the judge, and finer ones.
+# Each body with a physics step (s): the steps of training and of the judge, and finer steps.
 TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("planar", 0.032),
     ("wheeled", 0.016),
@@ -40,12 +42,12 @@ TIMESTEPS: tuple[tuple[Literal["planar", "wheeled"], float], ...] = (
     ("wheeled", 0.0005),
 )
 _STEP = 2e-5  # s; step of the reference; a step of 1e-5 changes the angles by less than 0.01 rad
-_SHARP = 1e-3  # m/s; for slower slip the reference's friction is proportional to the slip
-_WALL = 4e3, 64.0  # N/m, N s/m: the wall yields by 0.4 mm under the robot's push
+_SHARP = 1e-3  # m/s; at a slower slip the reference's friction is proportional to the slip
+_WALL = 4e3, 64.0  # N/m, N s/m; the robot's push moves the face of the wall by 0.4 mm
 
 
 class _Rigid(NamedTuple):
-    """A planar disc: x, y (m) and yaw (rad), their rates, and the wheels' traction [2, 2] (N)."""
+    """The state of a disc: x, y (m) and yaw (rad), their rates, and wheel traction [2, 2] (N)."""
 
     pose: np.ndarray
     rate: np.ndarray
@@ -53,7 +55,7 @@ class _Rigid(NamedTuple):
 
 
 def reference(wheels: Sequence[float], yaw: float, step: float = _STEP) -> np.ndarray:
-    """Integrates a rigid robot with Coulomb wheels against the east wall.
+    """Integrates the motion of a rigid robot with Coulomb friction against the east wall.
 
     Args:
       wheels: left and right speed, rad/s.
@@ -91,7 +93,10 @@ def _advance(state: _Rigid, rim: np.ndarray, step: float) -> _Rigid:
 
 
 def _loads(traction: np.ndarray, ahead: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Computes the weight on each wheel [2], N; traction shifts load to a skid and to one wheel."""
+    """Computes the load on each wheel [2], N.
+
+    Traction shifts load from the wheels to a skid, and from one wheel to the other.
+    """
     total, height = traction.sum(axis=0), epuck.COM_HEIGHT
     weight = epuck.MASS * epuck.GRAVITY
     skid = min(abs(total @ ahead) * height / epuck.SKID_X, weight)
@@ -100,7 +105,7 @@ def _loads(traction: np.ndarray, ahead: np.ndarray, left: np.ndarray) -> np.ndar
 
 
 def simulate(mine: rig.Rig, wheels: Sequence[float], yaw: float) -> np.ndarray:
-    """Simulates the same robot in MuJoCo C.
+    """Simulates a robot that is pressed against the east wall, in MuJoCo C.
 
     Args:
       mine: the robot.

@@ -1,29 +1,36 @@
-"""Implements Bug2 (Lumelsky & Stepanov 1987) from a robot's ten observations and its commands.
+"""Implements Bug2 (Lumelsky & Stepanov 1987) with only a robot's ten observations and commands.
 
 "Path-planning strategies for a point mobile automaton moving amidst unknown obstacles of arbitrary
-shape", Algorithmica 2, section 4. A robot drives along the line from the start to the target. At an
-obstacle it follows the outline on one side. When the robot meets the line closer to the target than
-where it left the line, it continues along the line.
+shape", Algorithmica 2, section 4. A robot drives along the line from the start to the target. When
+the robot meets an obstacle, it follows the obstacle's outline and keeps the obstacle on one side.
+When the robot is back on the line, and closer to the target than where it left the line, it
+continues along the line.
 
-A point automaton knows its position. Here a robot integrates its own commands to a heading. The
-heading, distance and bearing of the target give its position.
+In the paper the automaton measures its position. Here a robot integrates its own commands to get
+its heading. This heading, with the observed distance and bearing of the target, gives the robot's
+position.
 
-The line is infinite, not only the part between start and target. So a robot may leave an outline on
-the far side of the target, if the target is closer there.
+The line is infinite and does not end at the start or at the target. A robot may therefore leave an
+outline on the far side of the target, if it is closer to the target there than where it left the
+line.
 
-The paper's obstacles stand still, but robots are obstacles that move. Three rules are added:
+The paper's obstacles stand still, but robots are obstacles that move. Three rules are therefore
+added:
 
-1. All robots turn right when they meet something, so that it is on their left. Two robots that meet
-   head on thus pass each other. A standing robot is followed like any outline.
-2. If an outline is not sensed for `LOST` metres, it belonged to a robot that has gone, and a new
-   line starts here. If a robot has gone all the way round an outline without crossing the line
-   at a point closer to the target, the outline was not the one that blocked it. A new line
-   starts, and the next outline is followed on the other side.
-3. If a robot makes no progress for `STUCK` seconds, in front of another robot or between two, it
-   does the same as after a full round. This ends most deadlocks, but not all.
+1. A robot that meets an obstacle turns right, so that the obstacle is on its left. Two robots that
+   meet head on thus pass each other. A robot follows the outline of a standing robot like any other
+   outline.
+2. If a robot drives `LOST` metres without sensing the outline, the outline belonged to another
+   robot that has moved away, and the robot starts a new line. If a robot goes all the way round an
+   outline without crossing the line at a point closer to the target, this outline was not the one
+   that blocked the robot. The robot then starts a new line, and follows the next outline on the
+   other side.
+3. If a robot makes no progress for `STUCK` seconds, in front of another robot or between two
+   robots, it also starts a new line and follows the next outline on the other side. This rule ends
+   most deadlocks, but not all.
 
-A contact turns a robot, but the robot's commands do not show this. The line is then off by the
-angle of this turn until a new line starts.
+A contact can turn a robot without a command. The line is then off by the angle of this turn, until
+the robot starts a new line.
 """
 
 import math
@@ -39,14 +46,15 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim.drive import Drive
 from swarmjax.task import observation
 
-# Columns of an observation with the wall on the left, and on the right. First come the rays on the
-# wall's side: near the nose, diagonal, beside, behind. Then come the first three on the other side.
+# Columns of the rays in an observation, for a wall on the left and for a wall on the right. The
+# first four are the rays on the wall's side: near the nose, diagonal, beside, behind. The last
+# three are the rays on the other side: near the nose, diagonal, beside.
 _LEFT, _RIGHT = (7, 6, 5, 4, 0, 1, 2), (0, 1, 2, 3, 7, 6, 5)
 _TARGET = tuple(observation.NAMES.index(name) for name in ("target_distance", "target_bearing"))
 
 
 class Senses(NamedTuple):
-    """A robot's observation; each part is [...], and ray lengths are in m.
+    """A robot's observation; each field has shape [...], and ray lengths are in m.
 
     Attributes:
       nose, diagonal, beside, behind: rays on the side of the wall, from front to back.
@@ -67,20 +75,20 @@ class Senses(NamedTuple):
 
 
 class BugMemory(NamedTuple):
-    """A robot's memory; each part is [...] if no other shape is given.
+    """A robot's memory; each field has shape [...] unless another shape is given.
 
     Attributes:
-      heading: angle from the direction of the line, rad.
+      heading: angle between the robot's heading and the direction of the line, rad.
       following: whether the robot follows an outline.
-      side: 1.0 with the outline on the left, -1.0 on the right.
+      side: 1.0 if the outline is on the left, -1.0 if it is on the right.
       hit: distance to the target where the robot left the line, m.
-      beyond: offset from the line one control step ago, m; left is positive.
+      beyond: the robot's offset from the line one control step ago, m; left is positive.
       gap: distance to the outline beside the robot one control step ago, m.
       lost: distance driven since the outline was last sensed, m.
       way: distance driven since the robot left the line, m.
-      mark: [..., 3] a pose on the outline (m, m, rad) that shows when the robot has gone round the
-        outline.
-      marked: value of `way` at the mark.
+      mark: [..., 3] an earlier pose on the outline (m, m, rad); the robot has gone round the
+        outline when it is back at this pose.
+      marked: value of `way` when the mark was set, m.
       anchor: [..., 2] position near which the robot has recently been, m.
       waited: how long the robot has been near the anchor, s.
     """
@@ -100,12 +108,12 @@ class BugMemory(NamedTuple):
 
 
 class BugBody(NamedTuple):
-    """A robot's knowledge of itself.
+    """The properties of a robot that the controller uses.
 
     Attributes:
       drive: the robot's drive.
       hull_radius: radius of the hull, m.
-      target_radius: distance that counts as arrival, m.
+      target_radius: distance to the target that counts as arrival, m.
       sensor_range: range of the rays, m.
       control_step: time per control step, s.
     """
@@ -117,22 +125,24 @@ class BugBody(NamedTuple):
     control_step: float
 
 
-# Lengths in m. These values were chosen on benchmarks/maps, fence2, and levels of s6 and
-# crowd_dense with seed 7.
-GAP = 0.012  # between hull and outline
-AHEAD = 0.025  # a shorter ray near the nose blocks the way; a wall is then 0.017 m before the hull
+# Lengths are in m. These values were chosen on the maps of benchmarks/maps, on stage fence2, and on
+# levels of s6 and crowd_dense with seed 7.
+GAP = 0.012  # desired gap between hull and outline
+AHEAD = 0.025  # a shorter ray near the nose means a blocked way: a wall 0.017 m before the hull
 ASIDE = 0.0167  # the hull would hit the end of this diagonal ray: 0.025 + 0.717 * 0.0167 = 0.037
-NEARER = 0.03  # a robot this much closer to the target than when it left the line returns to it
-ROUND = 0.03  # how near the mark counts as back; the heading may differ by a right angle
-LOST = 0.33  # a full circle of the arc that seeks the outline: 2 pi (0.037 + 0.012) = 0.31
-STILL, STUCK = 0.02, 3.0  # m, s: no progress
+# A robot on an outline returns to the line only where it is closer to the target by more than this
+# than where it left the line.
+NEARER = 0.03
+ROUND = 0.03  # a robot is back at the mark within this distance and 90 degrees of heading
+LOST = 0.33  # longer than a full circle in search of the outline: 2 pi (0.037 + 0.012) = 0.31
+STILL, STUCK = 0.02, 3.0  # m, s; a robot that stays this close for this long makes no progress
 SPEED, CORNER_SPEED = 0.11, 0.08  # m/s, along an outline and round its corners
 TURN = 2.5  # rad/s, on the spot
-BY_ANGLE, BY_GAP = 4.0, 60.0  # rad/s per rad, and per m
+BY_ANGLE, BY_GAP = 4.0, 60.0  # gains of the turn rate, rad/s per rad and rad/s per m
 
 
 def start(seen: np.ndarray) -> BugMemory:
-    """Starts a line from the robots' positions to their targets.
+    """Starts a line from each robot's position to its target.
 
     Args:
       seen: [..., O] observations.
@@ -160,11 +170,11 @@ def start(seen: np.ndarray) -> BugMemory:
 
 
 def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
-    """Names the observations as seen from the side of the outline.
+    """Splits observations into named parts, as seen from the side of the outline.
 
     Args:
       seen: [..., O] observations, metric.
-      side: [...] 1.0 with the outline on the left, -1.0 on the right.
+      side: [...] 1.0 if the outline is on the left, -1.0 if it is on the right.
 
     Returns:
       The senses; the bearing stays as observed.
@@ -176,7 +186,7 @@ def sense(seen: np.ndarray, side: np.ndarray) -> Senses:
 
 
 def locate(heading: np.ndarray, senses: Senses) -> np.ndarray:
-    """Returns positions [..., 2], m: along the line, with the target at 0, and left of the line."""
+    """Returns positions [..., 2] from the target, m: along the line, and to the line's left."""
     toward = heading + senses.bearing
     return -senses.distance[..., None] * np.stack([np.cos(toward), np.sin(toward)], axis=-1)
 
@@ -186,11 +196,11 @@ def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, 
 
     Args:
       memory: [...] memory of the robots.
-      seen: [..., O] their observations, metric.
-      body: their knowledge of themselves.
+      seen: [..., O] the robots' observations, metric.
+      body: the robots' properties.
 
     Returns:
-      The memory, and actions [..., 2] in -1..1.
+      The new memory, and actions [..., 2] in -1..1.
     """
     memory = _begin_anew(memory, sense(seen, memory.side), body)
     senses = sense(seen, memory.side)
@@ -204,7 +214,7 @@ def act(memory: BugMemory, seen: np.ndarray, body: BugBody) -> tuple[BugMemory, 
 
 
 def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
-    """Applies rules 2 and 3: starts a new line where the outline is of no use."""
+    """Starts a new line where following the outline does not help: the module's rules 2 and 3."""
     place = locate(memory.heading, senses)
     near = np.linalg.norm(place - memory.mark[..., :2], axis=-1) < ROUND
     back = near & (np.cos(memory.heading - memory.mark[..., 2]) > 0.0)
@@ -224,7 +234,7 @@ def _begin_anew(memory: BugMemory, senses: Senses, body: BugBody) -> BugMemory:
 
 
 def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
-    """Leaves the line where something blocks it, and the outline where it meets the line again."""
+    """Decides which robots begin to follow an outline, and which return to the line."""
     ahead = np.minimum(senses.nose, senses.other_nose) < AHEAD
     aside = np.minimum(senses.diagonal, senses.other_diagonal) < ASIDE
     hits = ~memory.following & (ahead | aside) & (np.abs(senses.bearing) < math.pi / 4)
@@ -232,8 +242,8 @@ def _choose(memory: BugMemory, senses: Senses, place: np.ndarray) -> BugMemory:
     meets = beside * memory.beyond <= 0.0
     leaves = memory.following & meets & (senses.distance < memory.hit - NEARER)
     way = np.where(hits, 0.0, memory.way)
-    # The mark moves on whenever the distance driven has doubled (Brent 1980). The robot thus also
-    # notices a full round of an outline other than the one that it first met.
+    # The mark moves to the robot's pose whenever the distance driven has doubled (Brent 1980). The
+    # robot thus also detects a full round of an outline that is not the first one that it met.
     marks = hits | (way > 2.0 * np.maximum(memory.marked, LOST))
     pose = np.concatenate([place, memory.heading[..., None]], axis=-1)
     return memory._replace(
@@ -257,12 +267,13 @@ def _head_for_target(senses: Senses, body: BugBody) -> np.ndarray:
 
 
 def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
-    """Computes twists [..., 2] along the outline: m/s, and rad/s with left positive."""
+    """Computes twists [..., 2] along the outline: m/s and rad/s; a turn to the left is positive."""
     near = 0.99 * body.sensor_range
     other = senses.other_beside - (senses.beside - gap)
     wanted = np.minimum(GAP, 0.5 * (gap + other))
     turn = BY_ANGLE * _angle(memory, senses, gap, body) + BY_GAP * (gap - wanted)
-    # With the diagonal ray alone, its length is compared with that along a wall at the desired gap.
+    # If only the diagonal ray senses the outline, its length is compared with the length that it
+    # would have beside a wall at the desired gap.
     _, y, yaw = epuck.SENSOR_POSES[6]
     expected = (body.hull_radius + GAP - y) / math.sin(yaw)
     turn = np.where(senses.beside < near, turn, BY_GAP * (senses.diagonal - expected))
@@ -282,9 +293,10 @@ def _follow(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -
 
 
 def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) -> np.ndarray:
-    """Estimates the outline's direction from the nose, rad; away from the robot is positive.
+    """Estimates the angle between heading and outline, rad; positive if the outline leads away.
 
-    Uses the ends of two rays if both sense something, else the growth of the gap.
+    If the diagonal ray senses something, its end and the end of the ray beside the robot give the
+    angle. Otherwise the growth of the gap gives the angle.
     """
     x, y, yaw = epuck.SENSOR_POSES[6]
     ahead = x + senses.diagonal * math.cos(yaw)
@@ -297,7 +309,7 @@ def _angle(memory: BugMemory, senses: Senses, gap: np.ndarray, body: BugBody) ->
 def _remember(
     memory: BugMemory, senses: Senses, gap: np.ndarray, twist: np.ndarray, body: BugBody
 ) -> BugMemory:
-    """Integrates the motion of the wheels over this control step."""
+    """Updates the memory with the motion of the wheels over this control step."""
     drive, step = body.drive, body.control_step
     wheels = sim_drive.wheel_speeds(twist, drive, np)
     moved = sim_drive.body_velocity(wheels, drive.wheel_radius, drive.track, np) * step
@@ -325,7 +337,7 @@ def _action(twist: np.ndarray, drive: Drive) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Bug2:
-    """The controller of `engine_c.simulate`."""
+    """A controller for `engine_c.simulate` that drives robots by Bug2."""
 
     body: BugBody
 
@@ -339,7 +351,7 @@ class Bug2:
 
 
 def load(judge: Judge) -> Bug2:
-    """Makes the controller for a judge's robots, from their body's numbers."""
+    """Makes the controller for the robots of a judge, with the properties of their body."""
     task, robot = judge.config.task, judge.config.robot
     body = BugBody(
         drive=judge.drive,

@@ -1,11 +1,12 @@
-"""What do checkpoints cost training?
+"""How much training speed do checkpoints cost?
 
 `python -m benchmarks.checkpoint_price [every=S] [seconds=S] [key=value ...]` compiles the program
-of a config once. It then trains alternately with a checkpoint every `every` seconds, and without.
-All other keys are keys of `swarmjax.train`. It prints a JSON line with the arena control steps per
-second of both, and with the share of the speed that checkpoints take. All are medians over `PAIRS`
-pairs, and the share has a 95 % interval by order statistics. `price_at_60_s` is the same share,
-converted to one checkpoint a minute, since each checkpoint costs the same time.
+of a config once. The command then trains alternately with a checkpoint every `every` seconds, and
+without checkpoints during training. All other keys are keys of `swarmjax.train`. The command prints
+a JSON line with the arena control steps per second in both cases, and with the share of the speed
+that checkpoints cost. These numbers are medians over `PAIRS` pairs of training calls. The share
+also has a 95 % interval by order statistics. `price_at_60_s` is this share for one checkpoint a
+minute, if each checkpoint costs the same time.
 """
 
 import json
@@ -34,13 +35,13 @@ from swarmjax.sim import dispatch
 from swarmjax.training.loop import TrainState
 
 PAIRS = 6
-WARM_UP_S = 20.0  # training before the clock starts: calls grow longer, and robots learn to arrive
+WARM_UP_S = 20.0  # training before timing starts: calls grow longer, and robots learn to arrive
 _NEVER = 1e6  # minutes
 
 
 @dataclass(frozen=True, kw_only=True)
 class PriceConfig(Section):
-    """Settings: how often a checkpoint is written, and how long training lasts."""
+    """Settings: how often a checkpoint is written, and how long each training call lasts."""
 
     every: float = field(default=5.0, metadata=about("seconds between checkpoints", above=0.0))
     seconds: float = field(default=20.0, metadata=about("training time of each call", above=0.0))
@@ -54,7 +55,7 @@ class Clock(Display):
     """
 
     def __init__(self) -> None:
-        """Has noted nothing."""
+        """Starts with no records."""
         self.ends: list[tuple[float, int]] = []
 
     def say(self, sentence: str) -> None:
@@ -68,7 +69,7 @@ class Clock(Display):
         """Shows nothing."""
 
     def updates_per_s(self) -> float:
-        """Computes the speed between the end of the first call and the end of the last one."""
+        """Computes the speed from the end of the first call to the end of the last call."""
         (began, first), (ended, last) = self.ends[0], self.ends[-1]
         return (last - first) / (ended - began)
 
@@ -83,7 +84,10 @@ class Steady:
     state: TrainState
 
     def train(self, minutes: float, seconds: float) -> tuple[float, int]:
-        """Trains a copy of the state; returns updates per second and the number of checkpoints."""
+        """Trains a copy of the state; returns updates per second and the number of checkpoints.
+
+        The number does not include the first and the last checkpoint.
+        """
         clock, config = Clock(), self.program.config
         run = replace(config.run, checkpoint_minutes=minutes, checkpoint_share=0.0)
         program = replace(self.program, config=replace(config, run=run))
@@ -94,12 +98,12 @@ class Steady:
             directory.write_json(place / directory.CONFIG, {})
             trainer.train(place, program, self.schedule, self.compiled, copy, clock, stop)
             saved = directory.read_rows(place / directory.SAVED, None)
-        # The first and the last checkpoint are written in both cases.
+        # Both cases write the first and the last checkpoint, so these two do not count.
         return clock.updates_per_s(), len(saved) - 2
 
 
 def load(settings: TrainConfig) -> Steady:
-    """Compiles a config's program and trains until its speed is steady."""
+    """Compiles a config's program and trains for `WARM_UP_S`, until the speed is steady."""
     program, schedule, state = lifecycle.begin(settings)
     compiled, state = trainer.prepare(program, schedule, state, memory.limit())
     began = time.perf_counter()
@@ -109,7 +113,7 @@ def load(settings: TrainConfig) -> Steady:
 
 
 def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
-    """Trains alternately with checkpoints and without; returns the line."""
+    """Trains alternately with and without checkpoints; returns the JSON line."""
     steady = load(settings)
     found = in_turn(
         lambda: steady.train(config.every / 60.0, config.seconds),

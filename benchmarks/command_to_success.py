@@ -1,15 +1,16 @@
-"""How many seconds after the command does a swarm reach its targets, and how good is it then?
+"""How long after the command starts does a swarm reach its targets, and how good is its policy?
 
 `python -m benchmarks.command_to_success seed=0,1,2 [stop_at=0.95] [key=value ...]` takes the keys
-of `swarmjax.train` and runs `swarmjax.train` once per seed, each time in its own process and with
-the caches that exist. The run is asked to stop as soon as robots on its last stage reach at least
-`stop_at` of the targets over a whole cohort of training episodes. The saved policy is then judged
-in MuJoCo C on the wheeled body.
+of `swarmjax.train`. It runs `swarmjax.train` once per seed, each time in a new process that uses
+the existing caches. A run is stopped as soon as robots on its last stage reach at least `stop_at`
+of the targets over a whole cohort of training episodes. The saved policy is then judged in MuJoCo C
+on the wheeled body.
 
-It prints a JSON line for each seed. The line has the judged share of targets, and the seconds from
-the command until 0.90 and 0.95 were measured and until the policy was saved. These seconds include
-compilation. `benchmarks.time_to_success` measures the same for a finished run, without the time
-before its first update.
+The benchmark prints a JSON line for each seed. The line has the share of targets that the judge
+measured. It also has the seconds from the start of `swarmjax.train` until training measured the
+shares 0.90 and 0.95, and until the policy was saved. These seconds include compilation.
+`benchmarks.time_to_success` measures the seconds to a share for a finished run, without the time
+before the run's first update.
 """
 
 import sys
@@ -39,7 +40,7 @@ SHARES = (0.90, 0.95)
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessConfig(Section):
-    """Settings: which seeds, and how to judge them."""
+    """Settings: which seeds to train, when to stop, and how to judge the policies."""
 
     seed: tuple[int, ...] = field(
         default=(0,), metadata=about("random seeds, one after the other", 0, MAX_COUNT)
@@ -51,7 +52,7 @@ class SuccessConfig(Section):
 
 
 def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, float | None], Row]:
-    """Trains until the last stage reaches a share of the targets, or the budget is spent.
+    """Trains until robots on the last stage reach a share of the targets, or the budget is spent.
 
     Args:
       words: `key=value` words for training.
@@ -75,7 +76,7 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
 
 
 def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
-    """Judges a run's policy in MuJoCo C on wheels; returns targets reached and the action mode."""
+    """Judges a run's policy on wheels in MuJoCo C; returns its share of targets and action mode."""
     path = run / POLICY
     settings = load_levels(
         EvaluateConfig,

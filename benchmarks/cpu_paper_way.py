@@ -1,12 +1,13 @@
-"""How fast is training as in the paper, with PPO-PyTorch's update and one arena of MuJoCo C?
+"""How fast is the paper's way to train, PPO-PyTorch's update on one arena in MuJoCo C?
 
 `python -m benchmarks.cpu_paper_way [seconds=30] [rollout=6000] [key=value ...]` takes the keys of
-`swarmjax.evaluate` and needs PyTorch (`torch-peers.txt`). The settings are those of `algo=paper`.
+`swarmjax.evaluate` and needs PyTorch (`torch-peers.txt`). PPO has the settings of `algo=paper`.
 
 The program is a rewrite of nikhilbarhate99/PPO-PyTorch (commit 728cce8). Each robot has its own
-actor and critic and computes its action separately. Returns are Monte Carlo and normalised. After
-every `rollout` control steps, each pair of networks takes 80 optimiser steps on the whole rollout.
-It times whole cycles until `seconds` are over, after a short warm-up cycle.
+actor and critic and computes its action separately. Returns are Monte Carlo sums and are
+normalised. After every `rollout` control steps, each pair of networks takes `epochs` optimiser
+steps (80 by default) on the whole rollout. The command runs a short warm-up cycle, and then times
+whole cycles until `seconds` have passed.
 """
 
 import itertools
@@ -31,7 +32,7 @@ _WARM = 200  # control steps of the warm-up cycle
 
 @dataclass(frozen=True, kw_only=True)
 class PaperWayConfig(Section):
-    """Settings: how long to measure."""
+    """Settings: how long to measure, and the steps of a cycle."""
 
     seconds: float = field(default=30.0, metadata=about("minimum time of all cycles", above=0.0))
     rollout: int = field(default=6000, metadata=about("control steps per cycle", 2, 10**6))
@@ -39,7 +40,7 @@ class PaperWayConfig(Section):
 
 
 class Robot:
-    """One robot's networks, its optimiser, and its data of the current cycle."""
+    """One robot's actor and critic, their optimiser, and the data of the current cycle."""
 
     def __init__(self, torch: Any, algo: AlgoConfig) -> None:
         """Makes both networks with PyTorch's default initialisation."""
@@ -56,7 +57,7 @@ class Robot:
         self.forget()
 
     def forget(self) -> None:
-        """Begins a cycle."""
+        """Discards the stored data before a new cycle."""
         self._seen: list[Any] = []
         self._done: list[Any] = []
         self._log_prob: list[Any] = []
@@ -64,7 +65,7 @@ class Robot:
         self.ended: list[bool] = []
 
     def act(self, seen: np.ndarray) -> np.ndarray:
-        """Draws an action for an observation [O], and stores both."""
+        """Draws an action for an observation [O]; stores the action and the observation."""
         with self._torch.no_grad():
             state = self._torch.as_tensor(seen)
             chosen = self._distribution(state)
@@ -100,7 +101,7 @@ class Robot:
 
 
 def _network(torch: Any, hidden: Sequence[int], size: int, last: Any = None) -> Any:
-    """Makes layers with tanh between them, and `last` after the last one."""
+    """Makes a network of linear layers with tanh between them, and with `last` at its end."""
     widths, layers = [observation.SIZE, *hidden], []
     for wide, narrow in itertools.pairwise(widths):
         layers += [torch.nn.Linear(wide, narrow), torch.nn.Tanh()]
@@ -109,7 +110,7 @@ def _network(torch: Any, hidden: Sequence[int], size: int, last: Any = None) -> 
 
 
 def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) -> np.ndarray:
-    """Sums rewards up to the end of each episode, or of the cycle.
+    """Computes the discounted return of each step, to the end of its episode or of the cycle.
 
     Args:
       reward: [T] rewards.
@@ -127,7 +128,7 @@ def discounted(reward: Sequence[float], ended: Sequence[bool], discount: float) 
 
 
 def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) -> None:
-    """Drives for `steps` control steps from a fresh level, then lets every robot learn.
+    """Runs the robots for `steps` control steps from a new level, then trains their networks.
 
     Args:
       arena: one arena.
@@ -149,7 +150,7 @@ def cycle(arena: MujocoArena, robots: Sequence[Robot], steps: int, epochs: int) 
 def _control_step(
     arena: MujocoArena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
 ) -> tuple[Moved, list[Robot]]:
-    """Takes one control step; returns its results and which robots are still on their way."""
+    """Takes one control step; returns its results and the robots that have not yet arrived."""
     none = np.zeros(mujoco_arena.ACTION_SIZE, np.float32)
     ask = zip(robots, seen, strict=True)
     action = np.stack([robot.act(each) if robot in drives else none for robot, each in ask])
@@ -162,7 +163,7 @@ def _control_step(
 
 
 def results(given: PaperWayConfig, words: list[str]) -> Iterator[dict[str, Any]]:
-    """Trains for a while; yields the line."""
+    """Trains until enough cycles are timed; yields the JSON line."""
     torch = peers.find("torch", peers.TORCH)
     judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
     algo = load_train(["algo=paper"]).algo

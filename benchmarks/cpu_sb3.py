@@ -1,12 +1,12 @@
-"""How fast does Stable-Baselines3's PPO train on a vectorised environment of MuJoCo C?
+"""How fast does Stable-Baselines3's PPO train on a vectorised environment in MuJoCo C?
 
 `python -m benchmarks.cpu_sb3 [arenas=16] [workers=2] [seconds=30] [key=value ...]` takes the keys
-of `swarmjax.evaluate` and needs `torch-peers.txt`. Every robot is one environment of
-Stable-Baselines3. All robots share one policy, and `workers` processes simulate the arenas.
+of `swarmjax.evaluate` and needs the packages in `torch-peers.txt`. Every robot is one environment
+of Stable-Baselines3. All robots share one policy, and `workers` processes simulate the arenas.
 Networks, batch per robot, epochs, minibatches, discount and clip are those of `algo=ppo`.
-Observations are not normalised. Stable-Baselines3 has no mask, so an arrived robot waits in the
-batch with reward 0 until its arena is over. Iterations of rollout and update are timed until
-`seconds` are over, after one warm-up iteration.
+Observations are not normalised. Stable-Baselines3 cannot mask samples, so an arrived robot stays in
+the batch with reward 0 until its arena's episode ends. After one warm-up iteration, the command
+times iterations of rollout and update until `seconds` have passed.
 """
 
 import itertools
@@ -34,7 +34,7 @@ _LEVELS = 1_000_000  # level numbers reserved for each arena
 
 @dataclass(frozen=True, kw_only=True)
 class Sb3Config(Section):
-    """Settings of the measurement."""
+    """Settings: how many arenas and processes, and how long to measure."""
 
     arenas: int = field(default=16, metadata=about("arenas", 1, 4096))
     workers: int = field(default=2, metadata=about("processes that simulate", 1, 256))
@@ -48,12 +48,12 @@ class Sb3Config(Section):
 
 
 def serve(pipe: Connection, judged: EvaluateConfig, numbers: Sequence[int]) -> None:
-    """Simulates some arenas in its own process, until it receives None.
+    """Simulates some arenas in a worker process, until it receives None.
 
     Args:
-      pipe: receives actions [A R, 2]; the first message has no action. It sends observation
-        [A R, O], reward, done, truncated [A R] and, for robots that are done, the observation
-        before the reset.
+      pipe: connection to the main process. The worker first sends the initial observations
+        [A R, O]. For each message of actions [A R, 2] the worker then sends observations [A R, O],
+        reward, done and truncated [A R], and the observations before any reset [A R, O].
       judged: settings of the arenas.
       numbers: [A] numbers of the arenas.
     """
@@ -89,7 +89,7 @@ class Workers:
     """Processes that simulate arenas; each robot is an environment."""
 
     def __init__(self, given: Sb3Config, judged: EvaluateConfig) -> None:
-        """Starts them."""
+        """Starts the processes."""
         context = multiprocessing.get_context("spawn")
         each = given.arenas // given.workers
         self._pipes: list[Any] = []
@@ -106,7 +106,7 @@ class Workers:
             pipe.send(part)
 
     def receive(self) -> list[np.ndarray]:
-        """Receives the results of `_step` for all robots, without the list of waiting robots."""
+        """Receives the results of `_step` for all robots, except which robots wait."""
         found = [pipe.recv() for pipe in self._pipes]
         return [np.concatenate([each[i] for each in found]) for i in range(5)]
 
@@ -119,7 +119,7 @@ class Workers:
 def vectorised(workers: Workers) -> Any:
     """Wraps the arenas in the interface of Stable-Baselines3.
 
-    The class is defined in this function, since the library may not be installed.
+    The class is defined in this function, since Stable-Baselines3 may not be installed.
     """
     spaces = peers.find("gymnasium.spaces", peers.TORCH)
     base = peers.find("stable_baselines3.common.vec_env", peers.TORCH).VecEnv
@@ -147,7 +147,7 @@ def vectorised(workers: Workers) -> Any:
 
 
 def ppo_settings(robots: int) -> dict[str, Any]:
-    """Translates the settings of `algo=ppo` to Stable-Baselines3, for `robots` robots in total."""
+    """Returns the settings of `algo=ppo` for Stable-Baselines3, with `robots` robots in total."""
     trained = load_train(["stage=s6"])
     algo = trained.algo
     return {
@@ -170,7 +170,7 @@ def ppo_settings(robots: int) -> dict[str, Any]:
 
 
 def results(given: Sb3Config, words: list[str]) -> Iterator[dict[str, Any]]:
-    """Trains for a while; yields the line."""
+    """Trains until enough iterations are timed; yields the JSON line."""
     sb3, torch = peers.find("stable_baselines3", peers.TORCH), peers.find("torch", peers.TORCH)
     judged = mujoco_arena.load_settings(["stage=s6", "robot=planar", "steps=500", *words])
     workers = Workers(given, judged)

@@ -1,20 +1,21 @@
 """Where does a curriculum help?
 
-Each mode of the curriculum is compared with training on the goal alone, at equal steps.
+Each mode of the curriculum is compared with training on the goal alone, at equal arena steps.
 
 `python -m benchmarks.curriculum goal=s6 arms=final,sequential,mixed,adaptive [key=value ...]` takes
 the keys of `curriculum_arms.StudyConfig` and of `swarmjax.train`, except `stage`, `algo.policy` and
 `curriculum.mode`, which the arms set. `seeds` is 10 by default.
 
-Each arm trains all its seeds in one program. Training stops at points that are evenly spaced over
-the logarithm of the arena steps, and the policies of every seed are judged on the device. All arms
-are judged on the same levels of three stages: the goal, the 1.5 m arena (with 5 robots compiled
-in), and the first stage of the goal's curriculum. No arm trains on the 1.5 m arena, and some arms
-do not train on the first stage. As soon as an arm is done with a policy, a JSON line is printed.
-`benchmarks.curriculum_table` makes tables and plots from the lines.
+Each arm trains all its seeds in one program. Training pauses at points that are evenly spaced on a
+logarithmic scale of arena steps, and at each point the policies of every seed are judged on the
+device. All arms are judged on the same levels of the goal. If the program is compiled for 5 robots,
+all arms are also judged on the 1.5 m arena and on the first stage of the goal's curriculum. No arm
+trains on the 1.5 m arena, and some arms do not train on the first stage. The command prints a JSON
+line for each arm and kind of policy as soon as the arm has finished.
+`benchmarks.curriculum_table` makes tables and plots from these lines.
 
 The baseline `final` trains on the goal alone. To compare options of one mode, run one arm at a time
-and label it: `arms=adaptive label=progress curriculum.score=progress`.
+and give it a label: `arms=adaptive label=progress curriculum.score=progress`.
 """
 
 import hashlib
@@ -52,7 +53,9 @@ Judge = Callable[[LearnerState], dict[str, dict[str, np.ndarray]]]
 
 
 def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, StageConfig]) -> Judge:
-    """Makes the judge of all points, arms and policies; it compiles once for each kind of policy.
+    """Makes one judge for all points, arms and policies.
+
+    The judge compiles once for each kind of policy.
 
     Args:
       study: the study.
@@ -60,8 +63,8 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
       judged: the stages, by role.
 
     Returns:
-      A function that takes learners [N, L]. For each role it returns the `Outcomes`, each as a mean
-      [N] over the levels.
+      A function that takes learners [N, L]. For each role it returns every field of `Outcomes` as a
+      mean [N] over the levels.
     """
     stages, arenas = tuple(judged.values()), len(judged) * study.levels
     world = env.load(
@@ -102,7 +105,7 @@ def means(found: Outcomes, names: Sequence[str]) -> dict[str, dict[str, np.ndarr
       names: S names of the stages.
 
     Returns:
-      For each name the means [N], by measure.
+      The means [N] by stage name and measure.
     """
     split = {name: np.split(np.asarray(x), len(names), 1) for name, x in found._asdict().items()}
     return {
@@ -116,15 +119,15 @@ class Curves:
     """The results of an arm.
 
     Attributes:
-      judged: [N, P] results by role and measure.
-      transitions: [N, P] robot steps that each seed has trained on up to the point.
-      stage: [N, P] index of the newest stage.
+      judged: [N, P] results of N seeds at P points, by role and measure.
+      transitions: [N, P] robot steps that each seed has trained on up to each point.
+      stage: [N, P] index of the newest stage at each point.
       mix: [P, S] share of the arenas on each stage, over all seeds.
-      broken_arenas: training episodes that ended because the physics broke, over all seeds.
-      train_s: [P] seconds of training up to the point, without compiling and judging.
+      broken_arenas: number of training episodes that broken physics ended, over all seeds.
+      train_s: [P] seconds of training up to each point, without compiling and judging.
       judge_s: seconds of judging.
       compile_s: seconds of compiling the training.
-      judge_compile_s: seconds of a first judging, including its compilation.
+      judge_compile_s: seconds of the first judging, including its compilation.
     """
 
     judged: dict[str, dict[str, list[list[float]]]]
@@ -153,7 +156,8 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
     state = jax.jit(mesh.init(program))(schedule)
     compiled = trainer.compile_chunk(program, schedule, state)
     call = partial(compiled.call, schedule)
-    # Warp builds its kernels in its first step, which does not count as training either.
+    # This first judging includes compilation, and the time in which Warp builds its kernels in its
+    # first step. Neither counts as training.
     judge_compile_s, _ = _timed(partial(judge, jax.device_get(state.learners)))
     rows, train_s, judge_s = [], [], 0.0
     for n in np.diff(at, prepend=0):
@@ -180,7 +184,7 @@ def measure(trained: TrainConfig, at: np.ndarray, judge: Judge) -> Curves:
 
 
 def _curve(rows: Sequence[np.ndarray]) -> list[list[float]]:
-    """Turns P rows [N] into lists [N, P], with five digits."""
+    """Turns P rows [N] into lists [N, P], rounded to five decimals."""
     return np.array(rows, np.float64).T.round(5).tolist()
 
 
@@ -230,7 +234,7 @@ def results(study: StudyConfig, words: Sequence[str]) -> Iterator[dict[str, Any]
 
 
 def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
-    """Describes an arm."""
+    """Returns the entries of the JSON line that describe an arm."""
     whole = to_dict(trained)
     digest = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
     return {

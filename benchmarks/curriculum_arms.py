@@ -1,7 +1,7 @@
-"""Defines what a study of curricula compares: its arms, the points in training, and the stages.
+"""Defines the arms that a study of curricula compares, and when and on which stages it judges them.
 
-An arm is a curriculum mode with the stages that lead to the goal. `final` is the baseline with the
-goal alone. `benchmarks.curriculum` describes the command.
+An arm is a curriculum mode with the stages that lead to the goal. The arm `final` is the baseline,
+which trains on the goal alone. `benchmarks.curriculum` describes the command.
 """
 
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ from swarmjax.task.stage_config import StageConfig
 BASELINE = "final"
 HELD_OUT = "expanded"
 GRID_GOAL = "s6"
-HELD_OUT_ROBOTS = 5  # policies trained with more robots are judged on their goal alone
+HELD_OUT_ROBOTS = 5  # with another `sim.max_robots`, policies are judged on the goal alone
 _CHOSEN = {"stage": "goal", "algo.policy": "policies", "curriculum.mode": "arms"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Section):
-    """Settings: what to compare, and how to judge it."""
+    """Settings: which arms to compare, and how to judge them."""
 
     goal: str = field(default="s6", metadata=about("final stage of all arms"))
     arms: tuple[Literal["final", "sequential", "mixed", "adaptive", "adaptive-grid"], ...] = field(
@@ -56,7 +56,7 @@ class StudyConfig(Section):
 
 
 def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
-    """Separates the study's words from those for training.
+    """Separates the words for the study from the words for training.
 
     Args:
       words: `key=value` words of the command line.
@@ -65,7 +65,7 @@ def parse(words: Sequence[str]) -> tuple[StudyConfig, list[str]]:
       The study, and the words for training.
 
     Raises:
-      ConfigError: if a word of the study is invalid, or a word for training is set by the arms.
+      ConfigError: if a word of the study is invalid, or a word sets a key that the arms set.
     """
     for key in (word.partition("=")[0] for word in words):
         if key in _CHOSEN:
@@ -88,7 +88,7 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
       words: `key=value` words for training.
 
     Returns:
-      The config; all arms of a study have the same arenas and budget.
+      The config; all arms of a study have the same number of arenas and the same budget.
 
     Raises:
       ConfigError: if a word is invalid.
@@ -101,14 +101,14 @@ def load_arm(study: StudyConfig, arm: str, policy: str, words: Sequence[str]) ->
 
 
 def points(study: StudyConfig, trained: TrainConfig) -> np.ndarray:
-    """Computes the updates [P] after which arms are judged, evenly spaced in their logarithm.
+    """Computes the updates [P] after which arms are judged, evenly spaced on a logarithmic scale.
 
     Args:
       study: the study.
       trained: the config of an arm.
 
     Returns:
-      Increasing integers up to the whole budget; fewer than requested if some are equal.
+      Increasing integers up to the whole budget; fewer than requested if rounding makes some equal.
 
     Raises:
       ConfigError: if the budget ends before the first point.

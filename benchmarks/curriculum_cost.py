@@ -1,11 +1,12 @@
 """How much training speed does the curriculum's engine cost?
 
-`python -m benchmarks.curriculum_cost [key=value ...]` takes the keys of `swarmjax.train` and trains
-pairs of programs alternately: one stage alone, and a curriculum of `COPIES` copies of that stage in
-each mode. Both simulate the same mix and differ only in the curriculum's engine. For each mode a
-JSON line is printed. The line has the median ratio of the mode's speed to the speed of the single
-stage, and the 95 % interval of this median. The interval is by order statistics, which assumes no
-distribution.
+`python -m benchmarks.curriculum_cost [key=value ...]` takes the keys of `swarmjax.train`. For each
+mode it trains two programs alternately. The first program trains on one stage alone. The second
+trains on a curriculum of `COPIES` copies of this stage, in the given mode. Both programs simulate
+the same mix of arenas and differ only in the curriculum's engine. The command prints a JSON line
+for each mode. The line has the median ratio of the mode's speed to the speed of the single stage,
+and the 95 % interval of this median. The interval is computed from order statistics, without
+assuming a distribution.
 """
 
 import json
@@ -22,7 +23,7 @@ from swarmjax.sim import dispatch
 
 PAIRS = 20
 COPIES = {"sequential": 6, "mixed": 6, "adaptive": 6, "adaptive-grid": 48}
-CALL_SECONDS = 0.7  # approximate time per call
+CALL_SECONDS = 0.7  # approximate time per training call
 
 
 def curriculum(settings: TrainConfig, name: str) -> TrainConfig:

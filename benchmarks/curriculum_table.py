@@ -1,20 +1,23 @@
-"""Makes tables and learning curves from the lines of `benchmarks.curriculum`.
+"""Makes tables and learning curves from the JSON lines of `benchmarks.curriculum`.
 
 `python -m benchmarks.curriculum_table FILE... [measure=all_reached] [out=DIR]` prints a Markdown
 table for each goal, kind of policy, number of arenas and budget. With `out` it also draws the
 learning curves into DIR, as `<goal>-<policy>-<arenas>-<budget>-<measure>.png`. The measure is the
 share of targets reached, or the share of episodes in which all targets were reached.
 
-Every number is the interquartile mean over seeds, with the 95 % interval of a stratified bootstrap
-over seeds (swarmjax.evaluate.statistics). The columns are:
+Every number has the 95 % interval of a stratified bootstrap over seeds
+(swarmjax.evaluate.statistics). All numbers except the probabilities are interquartile means over
+seeds. The columns are:
 
-- `goal`, `1.5 m`: the final share, on the goal and in the arena that no arm trained on.
+- `goal`, `1.5 m`: the final share on the goal, and the final share in the 1.5 m arena, on which no
+  arm trained.
 - `to 0.8`, `to 0.9`: arena steps until a seed's share on the goal first reaches this value.
-- `area`, `area (log)`: mean share on the goal over training, by arena steps and by their logarithm.
-- `forgotten`: the best share on the first stage at any point, minus the last one; `-` if the first
-  stage was not judged.
-- `P(end)`, `P(area)`: probability that a seed ends higher than a seed of the baseline, and that its
-  `area` is larger.
+- `area`, `area (log)`: mean share on the goal during training. The mean of `area` is over the arena
+  steps, and the mean of `area (log)` is over the logarithm of the arena steps.
+- `forgotten`: the best share on the first stage at any point, minus the final share on this stage;
+  `-` if the first stage was not judged.
+- `P(end)`, `P(area)`: the probability that a seed ends with a higher share than a seed of the
+  baseline, and the probability that the seed's `area` is larger.
 """
 
 import json
@@ -58,15 +61,16 @@ class Key(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """The results of an arm; each has one value per seed, [N].
+    """The results of an arm; each field has one value per seed, [N].
 
     Attributes:
       goal: final share on the goal.
       held_out: final share in the 1.5 m arena; None if it was not judged.
-      steps: arena steps until each threshold was first reached; inf if it never was.
+      steps: arena steps until each threshold was first reached; inf if it was never reached.
       area: mean share over arena steps.
       log_area: mean share over the logarithm of arena steps.
-      forgotten: best share on the first stage minus the last one; None if it was not judged.
+      forgotten: best share on the first stage minus the final share on it; None if the first stage
+        was not judged.
     """
 
     goal: np.ndarray
@@ -88,7 +92,7 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
 
     Raises:
       ConfigError: if an arm appears twice, or arms of a table were judged differently. Arms may
-        have different roles; only the roles that they share must agree.
+        have different roles; only the roles that two arms share must have the same stage.
     """
     found: dict[Key, dict[str, Line]] = {}
     for line in sorted(lines, key=lambda line: line["arm"] != BASELINE):
@@ -108,7 +112,7 @@ def tables(lines: Sequence[Line]) -> dict[Key, dict[str, Line]]:
 
 
 def _differs(name: str, one: Any, other: Any) -> bool:
-    """Tells whether two lines differ in a shared setting; roles count only if both have them."""
+    """Tells whether two lines differ in a shared setting; only roles of both lines are compared."""
     if name != "roles":
         return one != other
     return any(one[role] != other[role] for role in one.keys() & other.keys())
@@ -162,7 +166,7 @@ def _title(key: Key) -> str:
 
 
 def _cells(mine: Figures) -> Iterator[str]:
-    """Writes the columns of an arm's own results."""
+    """Yields the cells of an arm's own results."""
     yield _share(mine.goal)
     yield _share(mine.held_out)
     for steps in mine.steps.values():
@@ -172,7 +176,7 @@ def _cells(mine: Figures) -> Iterator[str]:
 
 
 def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
-    """Writes the columns of the probabilities that an arm beats the baseline."""
+    """Yields the cells of the probabilities that an arm beats the baseline."""
     if baseline is None:
         return
     for name in ("goal", "area"):
@@ -182,7 +186,7 @@ def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
 
 
 def _over_seeds(values: np.ndarray) -> Interval[float]:
-    """Computes the interquartile mean of values [N], with its interval."""
+    """Computes the interquartile mean of values [N], with the mean's interval."""
     return statistics.bootstrap(values[:, None], statistics.iqm)
 
 
@@ -191,7 +195,7 @@ def _share(values: np.ndarray | None) -> str:
 
 
 def _count(steps: float) -> str:
-    """Writes a number of steps with two digits."""
+    """Writes a number of steps with two significant digits."""
     return "never" if np.isinf(steps) else f"{float(f'{steps:.2g}'):,.0f}"
 
 
@@ -201,7 +205,7 @@ def _words(interval: Interval[float], word: Callable[[float], str]) -> str:
 
 
 def draw(key: Key, arms: dict[str, Line], measure: str, path: Path) -> None:
-    """Draws the learning curves of some arms, with their bands.
+    """Draws the learning curves of some arms, with the bands of their intervals.
 
     Args:
       key: the settings that the arms share.
@@ -312,7 +316,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _draw_all(found: dict[Key, dict[str, Line]], measure: str, out: Path) -> None:
-    """Draws the learning curves of every table into a directory, and creates the directory."""
+    """Creates a directory and draws the learning curves of every table into it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for key, arms in found.items():

@@ -1,15 +1,16 @@
-"""Writes docs/scaling.md: the speed-up by several devices, and a model's predictions for more.
+"""Writes the measured speed-ups and a model's predictions for more devices into docs/scaling.md.
 
 `python -m benchmarks.devices_page [lines=benchmarks/results/devices.jsonl] [docs=docs]` writes the
-tables between the page's markers, and the plot `figures/devices.png`. It uses the newest line of
-each comparison of `benchmarks.devices_speed`, and the lines of `benchmarks.all_reduce`.
+tables between the page's markers, and the plot `figures/devices.png`. The command uses the newest
+line of each comparison of `benchmarks.devices_speed`, and the lines of `benchmarks.all_reduce`.
 
 The model describes an update on N devices with equal shares of the work. The update takes the time
 of one device, plus the latency of each sum over devices. The latency within a host is measured. The
-latency between hosts grows with the logarithm of their number. Devices also wait for the slowest
-one. If times vary normally, the slowest of N is expected `EXPECTED_MAX[N]` deviations above the
-mean (Harter 1961, "Expected values of normal order statistics", table 1, for 2 and 8; simulated for
-64 and 512).
+latency between hosts grows with the logarithm of the number of hosts. Devices also wait for the
+slowest device. If the devices' times are normally distributed, the slowest of N devices is
+expected to be `EXPECTED_MAX[N]` standard deviations above the mean. The values for 2 and 8 devices
+are from Harter 1961, "Expected values of normal order statistics", table 1. The values for 64 and
+512 devices are simulated.
 """
 
 import json
@@ -34,14 +35,14 @@ EXPECTED_MAX = {1: 0.0, 2: 0.564, 8: 1.424, 64: 2.34, 512: 3.05}
 # program has.
 REDUCES = 13
 _HOST = 8  # devices per host
-_HOP_US = 15.0  # each doubling of hosts adds this to a sum; assumed, not measured
+_HOP_US = 15.0  # time that each doubling of hosts adds to a sum; assumed, not measured
 _ROLLOUT = 32  # control steps per update, the default
-_MESSAGE = 65_536  # bytes: networks of 40 kB, rounded up to a size that was timed
+_MESSAGE = 65_536  # bytes; the networks' 40 kB, rounded up to a size that was timed
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageConfig(Section):
-    """Settings: where the numbers come from, and where the page goes."""
+    """Settings: the file of the results, and the folder of the page."""
 
     lines: str = field(
         default="benchmarks/results/devices.jsonl", metadata=about("file of JSON lines")
@@ -50,7 +51,7 @@ class PageConfig(Section):
 
 
 def update_ms(line: Line, devices: int) -> float:
-    """Returns the milliseconds per update, for one device or for all devices of a line."""
+    """Returns the milliseconds per update, on one device or on all devices of a line."""
     one = devices == 1
     steps = line["arenas"] if one else line["arenas_in_all"]
     speed = line["arena_steps_per_s_of_one"] if one else line["arena_steps_per_s"]
@@ -61,14 +62,14 @@ def sum_us(devices: int, measured_us: float) -> float:
     """Predicts the microseconds of a sum over devices.
 
     Args:
-      devices: N, in hosts of 8.
+      devices: number of devices, 8 per host.
       measured_us: measured time for two devices of one host.
     """
     return measured_us + _HOP_US * log2(ceil(devices / _HOST))
 
 
 def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float) -> float:
-    """Predicts the weak efficiency of N devices, 0..1.
+    """Predicts the weak-scaling efficiency of N devices, 0..1.
 
     Args:
       one_ms: time of an update on one device.
@@ -83,10 +84,11 @@ def predict(one_ms: float, devices: int, measured_us: float, deviation_ms: float
 
 
 def deviation_ms(line: Line, measured_us: float) -> float:
-    """Estimates the standard deviation of update times, from the time that two devices lose.
+    """Estimates the standard deviation of the devices' update times.
 
-    The loss that the sums over devices do not explain is attributed to waiting. The estimate is 0
-    if the devices lose less time than their sums take.
+    An update takes longer on two devices than on one. The extra time that the sums over devices do
+    not explain is attributed to waiting for the slower device. The estimate is 0 if the extra time
+    is shorter than the time of the sums.
 
     Args:
       line: line of a weak comparison of two devices.
@@ -148,7 +150,7 @@ def _predictions(line: Line, measured_us: float) -> dict[int, float]:
 
 
 def draw(lines: Sequence[Line], measured_us: float) -> Figure:
-    """Draws the measured efficiency and the model's curves."""
+    """Draws the measured efficiency and the curves of the model."""
     plot = Figure(figsize=(7.0, 4.0), layout="constrained")
     axes = plot.subplots()
     axes.grid(visible=True, alpha=0.3)
@@ -186,7 +188,7 @@ def write(lines: Sequence[Line], docs: Path) -> None:
     text = pages.insert(text, PAGE, "model", model_table(found, sums[_MESSAGE]))
     page.write_text(text)
     plot = draw(found, sums[_MESSAGE])
-    # Without Matplotlib's version, so that the same plot gives the same file.
+    # Leaves out Matplotlib's version, so that the same plot gives the same file.
     plot.savefig(docs / FIGURE, dpi=90, metadata={"Software": None})
 
 

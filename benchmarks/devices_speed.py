@@ -1,11 +1,12 @@
 """How much faster do several devices train than one?
 
 `python -m benchmarks.devices_speed devices=N [scaling=weak|strong] [key=value ...]` takes the keys
-of `swarmjax.train` and trains alternately on one device and on N. `scaling=weak` gives each device
-`arenas` arenas. `scaling=strong` spreads `arenas` over all devices. It prints a JSON line with the
-arena steps per second of both, and with their ratio. The line's `efficiency` is this ratio divided
-by N. Each number is the median over `PAIRS` pairs with a 95 % interval by order statistics. Compile
-time is listed separately.
+of `swarmjax.train` and trains alternately on one device and on N devices. `scaling=weak` gives each
+device `arenas` arenas. `scaling=strong` spreads `arenas` arenas over all devices. The command
+prints a JSON line with the arena steps per second in both cases, and with the ratio of the two
+speeds. The line's `efficiency` is this ratio divided by N. Each number is the median over `PAIRS`
+pairs. The ratio and the efficiency also have a 95 % interval by order statistics. Compile time is
+listed separately.
 
 With `run.coordinator`, `run.processes` and `run.process`, start the command once for each process.
 The first process then trains alternately on its own device and on all devices, and prints the line.
@@ -45,13 +46,13 @@ class DevicesConfig(Section):
 
 
 def parse(words: Sequence[str]) -> tuple[DevicesConfig, TrainConfig, TrainConfig]:
-    """Makes the settings of the comparison, for one device and for all.
+    """Makes the settings of the comparison, for one device and for all devices.
 
     Args:
       words: words of the command line.
 
     Returns:
-      The comparison, the settings for one device, and those for all devices.
+      The comparison, the settings for one device, and the settings for all devices.
 
     Raises:
       ConfigError: if a word is invalid, or there is only one device.
@@ -75,7 +76,7 @@ def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[s
       every: settings for all devices.
 
     Returns:
-      The line; None in all processes except the first.
+      The JSON line; None in all processes except the first.
     """
     alone, spread = (Arm(one) if hosts.is_first() else None), Arm(every)
     updates = _updates(alone)
@@ -89,7 +90,7 @@ def result(given: DevicesConfig, one: TrainConfig, every: TrainConfig) -> dict[s
 def _line(
     given: DevicesConfig, alone: Arm, spread: Arm, updates: int, pairs: list[tuple[float, float]]
 ) -> dict[str, Any]:
-    """Summarises the pairs."""
+    """Summarises the timed pairs as a JSON line."""
     one, every = alone.settings, spread.settings
     ratio, low, high = median([many / single for single, many in pairs])
     return {
@@ -123,7 +124,7 @@ def _updates(alone: Arm | None) -> int:
 
 
 def _speed(arm: Arm | None, updates: int) -> float:
-    """Returns the arena steps per second of one call; processes without the arm only wait."""
+    """Returns the arena steps per second of one call; NaN in a process without the arm."""
     if hosts.count() > 1:
         multihost_utils.sync_global_devices("before a call")
     if arm is None:

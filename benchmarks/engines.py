@@ -1,9 +1,9 @@
 """Do the training engine and the judge agree on a policy, level by level?
 
-`python -m benchmarks.engines policy=FILE [evaluate keys]` runs both on the same levels and prints a
-JSON line for each cell. The line has the targets reached in each engine with their intervals, the
-number of levels with equal results, and the largest differences. Only the engine differs, not the
-policy, the levels or the length of a physics step.
+`python -m benchmarks.engines policy=FILE [evaluate keys]` runs both engines on the same levels and
+prints a JSON line for each cell. The line has the share of targets reached in each engine with its
+interval, the share of levels with equal results, and the largest differences. Only the engine
+differs, not the policy, the levels or the length of a physics step.
 """
 
 import json
@@ -26,7 +26,7 @@ SAME_TIME = 0.032  # s; arrivals may fall into adjacent control steps
 
 
 def compare(c: Trial, mjx: Trial) -> dict[str, Any]:
-    """Compares the results of the engines on a cell.
+    """Compares the results of the two engines on a cell.
 
     Args:
       c: the judge's trial.

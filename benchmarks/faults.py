@@ -1,9 +1,10 @@
-"""What does the project do when something goes wrong? Runs campaigns of faults.
+"""Runs campaigns of faults, to test what the commands do when something goes wrong.
 
 `python -m benchmarks.faults campaign=NAME out=FILE [count=N] [seed=S]` tries one fault after the
-other and appends a JSON line for each trial to `out`. It may be stopped at any time. Started again,
-it continues with the trials that `out` lacks. `campaign=table out=FILE` prints a summary of `out`.
-A line has its `campaign`, `trial`, `seed`, `commit` and `outcome`, and the campaign's own entries.
+other and appends a JSON line for each trial to `out`. The command may be stopped at any time. When
+it is started again, it runs only the trials that are not yet in `out`. `campaign=table out=FILE`
+prints a summary of `out`. A line has the entries `campaign`, `trial`, `seed`, `commit` and
+`outcome`, and further entries that depend on the campaign.
 """
 
 import json
@@ -31,15 +32,16 @@ from swarmjax.config.section import MAX_COUNT
 
 Trial = Callable[[int, Path], dict[str, Any]]
 TABLE = "table"
-_BEGINNING = b'{"campaign'  # of a line
-_STRIDE = 1_000_000  # maximum trials per campaign: each has its own seed
+_BEGINNING = b'{"campaign'  # start of every line in `out`
+_STRIDE = 1_000_000  # maximum number of trials per campaign; each trial has its own seed
 
 
 class Campaign(NamedTuple):
     """Faults of one kind.
 
     Attributes:
-      trial: tries one fault, from a seed and an empty folder; returns the entries of its line.
+      trial: function that takes a seed and an empty folder, tries one fault, and returns the
+        entries of the trial's line.
       trials: the default number of trials.
     """
 
@@ -48,7 +50,7 @@ class Campaign(NamedTuple):
 
 
 CAMPAIGNS: dict[str, Campaign] = {
-    "kills": Campaign(faults_runs.kills, 50),  # with four kills each
+    "kills": Campaign(faults_runs.kills, 50),  # each trial has four kills
     "terms": Campaign(faults_runs.terms, 50),
     "checkpoints": Campaign(faults_runs.checkpoints, 2000),
     "disk": Campaign(faults_disk.trial, 40),
@@ -97,7 +99,7 @@ def read(out: Path) -> list[dict[str, Any]]:
       out: the file; it need not exist.
 
     Raises:
-      ConfigError: a line is no JSON object.
+      ConfigError: a line is not a JSON object.
     """
     if not out.exists():
         return []
@@ -113,7 +115,7 @@ def read(out: Path) -> list[dict[str, Any]]:
 
 
 def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
-    """Tries the faults that the file lacks, and yields each line once it is written.
+    """Runs the trials that are not yet in the file, and yields each line once it is written.
 
     Args:
       settings: the campaign's settings.
@@ -136,7 +138,7 @@ def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
 
 
 def _drop_torn(out: Path) -> None:
-    """Cuts off a last line that was only partly written."""
+    """Removes a last line that was only partly written."""
     out.parent.mkdir(parents=True, exist_ok=True)
     if not out.exists():
         return
@@ -148,7 +150,7 @@ def _drop_torn(out: Path) -> None:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Summarises lines: for each campaign the outcomes, and the maximum of each number.
+    """Counts the outcomes of each campaign, and finds the maximum of each number.
 
     Args:
       rows: the lines of the file.

@@ -1,12 +1,13 @@
-"""Campaign of `benchmarks.faults` against the disk, the directory and the clock of a run.
+"""A campaign of `benchmarks.faults` that disturbs a run's disk, directory or clock.
 
-In the first `SIZES` trials a run gets a small disk; the sizes go up to one that just holds the run.
-The other trials alternate between four faults: a disk that becomes read-only, a directory that is
-removed, two processes on one directory, and a clock that is set back. Afterwards the run is started
-once more without a fault, and must end like an undisturbed run.
+In the first `SIZES` trials a run gets a small disk. The disk's size grows from trial to trial, up
+to a size that just holds the run. The other trials alternate between four faults: a disk that
+becomes read-only, a directory that is removed, two processes on one directory, and a clock that is
+set back. Afterwards the run is started once more without a fault, and must end like an undisturbed
+run.
 
-Disks are mounted in their own namespace (`unshare`, util-linux). The clock is set by `libfaketime`.
-If either is missing, the outcome of the trial is `not tried`.
+Disks are mounted in a separate mount namespace (`unshare`, util-linux). `libfaketime` sets the
+clock. If `unshare` or `libfaketime` is missing, the outcome of the trial is `not tried`.
 """
 
 import contextlib
@@ -26,13 +27,13 @@ from benchmarks.faults_runs import is_whole, start, train_command, undisturbed
 from swarmjax.run import directory
 
 SIZES = 20
-PAGE = 4096  # bytes; a tmpfs has whole pages
+PAGE = 4096  # bytes; a tmpfs stores files in whole pages
 MOST_SECONDS = 120.0  # a run that takes longer counts as hanging
 _LIBRARY = "/usr/lib/*/faketime/libfaketime.so.1"  # Debian's package `libfaketime`
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Disturbs a run, then lets it end.
+    """Disturbs a run, then resumes it without a fault until it ends.
 
     Args:
       seed: Seed of the trial; the seed's last six digits choose the fault.
@@ -41,7 +42,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     Returns:
       The kind of fault, how the run ended, and the outcome.
     """
-    undisturbed()  # called first, since this call takes as long as a run
+    undisturbed()  # called first, since the uncached call takes as long as a run
     number, random = seed % 1_000_000, np.random.default_rng(seed)
     if number < SIZES:
         return _judge("full disk", _full(number, folder), folder / "run")
@@ -50,7 +51,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _judge(kind: str, told: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Lets the run end and tells whether anything was lost."""
+    """Resumes the run until it ends, and judges whether it lost anything."""
     if "missing" in told:
         return {"outcome": "not tried", "kind": kind, **told}
     process = start(run)
@@ -62,7 +63,7 @@ def _judge(kind: str, told: dict[str, Any], run: Path) -> dict[str, Any]:
 
 
 def _hindered(words: list[str], allowed: set[int], **given: Any) -> dict[str, Any]:
-    """Runs a command that may fail, but only with one sentence.
+    """Runs a command that may fail, but only with an allowed exit code and without a traceback.
 
     Args:
       words: The command.
@@ -89,7 +90,7 @@ def _hindered(words: list[str], allowed: set[int], **given: Any) -> dict[str, An
 
 @functools.cache
 def _needed() -> int:
-    """Returns the bytes of disk that an undisturbed run needs at its end."""
+    """Returns the disk space that an undisturbed run needs at its end, bytes."""
     with tempfile.TemporaryDirectory() as folder:
         start(Path(folder) / "run").communicate()
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
@@ -102,8 +103,8 @@ def _on_a_disk(folder: Path, size: int, options: str, run: Path | None = None) -
     Args:
       folder: Folder of the trial.
       size: Size of the disk, bytes.
-      options: Options of the mount once `run` has been copied to the disk.
-      run: A run that the disk already holds.
+      options: Mount options, set after `run` has been copied to the disk.
+      run: A run to copy to the disk first; None for a new run.
     """
     if shutil.which("unshare") is None:
         return {"missing": "unshare"}
@@ -143,7 +144,7 @@ def _begin(run: Path, random: np.random.Generator) -> None:
 
 
 def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
-    """Removes the directory of a run while it trains, and starts the run once more."""
+    """Removes the directory of a run while the run trains."""
     run = folder / "run"
     wait = random.uniform(0.0, 0.3) * undisturbed().ends_s
     log = run / directory.METRICS
@@ -151,7 +152,7 @@ def _removed(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     gone = subprocess.Popen(["sh", "-c", remove])
     told = _hindered(train_command(run), {0, 1})
     gone.wait()
-    shutil.rmtree(run, ignore_errors=True)  # files written after the removal
+    shutil.rmtree(run, ignore_errors=True)  # files that were written after the removal
     return told
 
 
@@ -162,13 +163,14 @@ def _two(random: np.random.Generator, folder: Path) -> dict[str, Any]:
     time.sleep(random.uniform(0.0, 0.8) * undisturbed().ends_s)
     told = _hindered(train_command(run), {0, 2})
     first.communicate()
-    # One process trains and the other is refused; a late one finds nothing left to do.
+    # One process trains and the other is refused. If the second process starts late, it finds a
+    # finished run.
     codes = {first.returncode, told["code"]}
     return told | {"answered": told["answered"] and 0 in codes and codes <= {0, 2}}
 
 
 def _clock(random: np.random.Generator, folder: Path) -> dict[str, Any]:
-    """Resumes a run with the clock a day before the run began."""
+    """Resumes a run with the clock set back by one day."""
     library = next(iter(Path("/").glob(_LIBRARY[1:])), None)
     if library is None:
         return {"missing": "libfaketime"}

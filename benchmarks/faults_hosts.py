@@ -1,8 +1,9 @@
-"""Campaign of `benchmarks.faults` against runs of two processes: one of them is killed.
+"""A campaign of `benchmarks.faults` that kills one of the two processes of a run.
 
 A trial starts two processes with one device each, kills one of them at a random moment, and checks
-how the other one ends. The run is then resumed with one device, or with two, to its end. On a
-machine with GPUs each process uses one GPU. Elsewhere they are CPU processes over gloo.
+how the other process ends. The run is then resumed on one or two devices until it ends. On a
+machine with GPUs each process uses one GPU. On other machines the processes use the CPU and
+communicate through gloo.
 """
 
 import contextlib
@@ -40,10 +41,10 @@ _POLL = 0.02  # s
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Kills one of two processes; then lets the run end, on one device or on two.
+    """Kills one of two processes, then resumes the run on one or two devices until it ends.
 
     Args:
-      seed: chooses the moment, the process that is killed, and how the run is resumed.
+      seed: chooses the moment, the process to kill, and the number of devices after the resume.
       folder: an empty folder.
 
     Returns:
@@ -71,7 +72,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 class Lost(NamedTuple):
-    """How a process ended after its peer was killed.
+    """Describes how a process ended after its peer was killed.
 
     Attributes:
       updates: updates that the run had done.
@@ -87,7 +88,7 @@ class Lost(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether it ended in time, without a traceback, and with the exit code for a restart."""
+        """Whether the process ended in time, without traceback, with exit code `REQUEUE`."""
         soon, short = self.seconds < MOST_SECONDS, "Traceback" not in self.said
         return self.code == REQUEUE and soon and short and self.updates > 0
 
@@ -98,7 +99,7 @@ def _lose_one(run: Path, victim: int, after: float) -> Lost:
     try:
         _wait_for_metrics(run, both)
         time.sleep(after)
-        # Kills the child, since its parent reports how the child ended.
+        # Kills the child process and not its parent, since the parent reports how the child ended.
         _kill_child(both[victim])
         updates, began = _updates(run), time.monotonic()
         _, said = both[1 - victim].communicate(timeout=_TIMEOUT)
@@ -145,7 +146,7 @@ def _start(run: Path, devices: int) -> list[subprocess.Popen[str]]:
 def _own_device(process: int) -> dict[str, str]:
     """Returns the environment variables that give a process one device."""
     if gpus():
-        # Several trials may share a machine.
+        # Several trials may share a machine, so JAX must not reserve the whole GPU memory.
         return {"CUDA_VISIBLE_DEVICES": str(process), "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     return {"JAX_PLATFORMS": "cpu"}
 
@@ -177,7 +178,7 @@ def _updates(run: Path) -> int:
 
 
 def _success(run: Path) -> float | None:
-    """Reads the share of targets at the end of the run."""
+    """Reads the share of targets that were reached at the end of the run."""
     with contextlib.suppress(OSError, ValueError, KeyError):
         summary = json.loads((run / directory.SUMMARY).read_text())
         return next(iter(summary["targets_reached"][0].values()))

@@ -1,9 +1,9 @@
-"""Fuzzes command lines, YAML files, runs and policies, over all commands.
+"""Fuzzes all commands with mutated command lines, YAML files, runs and policies.
 
 A trial mutates valid words and files. Nine of ten trials run inside this process and only do what a
-command does before its work: they make settings and read files. The tenth trial is a separate
-process with very little work. Each trial must either run, or be refused in one sentence with exit
-code 2 within ten seconds. Memory and time are limited.
+command does before its work: they make settings and read files. Every tenth trial starts the
+command in a separate process, with very little work. Each command must either run, or refuse its
+input within ten seconds, in one sentence and with exit code 2. Memory and time are limited.
 """
 
 import contextlib
@@ -38,19 +38,19 @@ from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.run.settings import TrainConfig, load_run, load_train
 from swarmjax.suite import SuiteConfig
 
-# Processor time until a refusal; a clock would also count other work of the machine.
+# Seconds of processor time until a refusal; a wall clock would also count the machine's other work.
 MOST_SECONDS = 10.0
-_MOST_WAITING = 60.0  # s by the clock; a trial that takes longer hangs
-_MOST_MEMORY = 2**31  # bytes that a trial may take in addition to this process
+_MOST_WAITING = 60.0  # s by the wall clock; a trial that takes longer counts as hanging
+_MOST_MEMORY = 2**31  # bytes that a trial may take in addition to the memory of this process
 _PROCESS_MEMORY = 2**34  # bytes of address space; JAX reserves more than it uses
-_PROCESS_SECONDS = 180.0  # limit for a whole process, on a machine with other work
+_PROCESS_SECONDS = 180.0  # s; limit for a separate process, on a machine that does other work
 _EVERY = 10  # one of this many trials starts a separate process
 _ROOT = Path(__file__).resolve().parents[1]
 _PYTHONPATH = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
 Words = Sequence[str]
 
 
-# What a command does before its work
+# Functions that do only the first part of a command: they make settings and read files
 
 
 def _train(words: Words) -> None:
@@ -117,7 +117,7 @@ _SOUND: dict[str, list[str]] = {
     "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }
-# Words appended to give a process very little work: the last word for a key counts.
+# Words that are appended to give a process very little work; the last word for a key counts.
 _TINY: dict[str, list[str]] = {
     "train": ["run.dry=true", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
@@ -156,7 +156,7 @@ _NASTY = [
 
 
 def _write_files(draw: random.Random) -> None:
-    """Writes the files named in words into the working folder, and damages one of them."""
+    """Writes the files that are named in words to the working folder; damages at most one file."""
     faults_policies.write_sound(Path("policy.npz"), draw)
     faults_policies.write_sound(Path("b.npz"), draw)
     Path("mine.yaml").write_text(_STAGE)
@@ -184,7 +184,7 @@ def _write_run(run: Path) -> None:
 
 
 def _spoil(name: str, draw: random.Random) -> None:
-    """Damages one of the files."""
+    """Damages one of the files in the working folder."""
     where = {"config": "run/config.json", "metrics": "run/metrics.jsonl"}
     path = Path(where.get(name, name))
     if name == "policy.npz":
@@ -198,7 +198,7 @@ def _spoil(name: str, draw: random.Random) -> None:
 
 
 def _mutate_text(text: str, draw: random.Random) -> str:
-    """Changes YAML or JSON: a letter, a line, a value, or the whole text."""
+    """Changes a YAML or JSON text: a few letters, a line, a value, or the whole text."""
     lines = text.splitlines(keepends=True) or [""]
     at, line = draw.randrange(len(text) + 1), draw.randrange(len(lines))
     bomb = "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 20))
@@ -221,7 +221,7 @@ def _mutate_text(text: str, draw: random.Random) -> str:
 
 
 def _other_value(text: str, draw: random.Random) -> str:
-    """Replaces a number or word of a file with a nasty value."""
+    """Replaces a number or a word in the text of a file with a value from `_NASTY`."""
     found = [*re.finditer(r"(?<=: )[\w.\"-]+", text)]
     if not found:
         return text
@@ -230,12 +230,12 @@ def _other_value(text: str, draw: random.Random) -> str:
 
 
 def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> list[str]:
-    """Adds a word with a nasty value, or damages an existing one."""
+    """Makes a mutated word, and appends it or replaces an existing word with it."""
     keys = [*section.keys(cls), *files.defaults(cls.command)]
     at = draw.randrange(len(words)) if words else 0
     nasty, key = draw.choice(_NASTY), draw.choice(keys)
     word = words[at] if words else "seed=0"
-    cut = draw.randrange(max(1, len(word)))  # an earlier mutation may have left nothing
+    cut = draw.randrange(max(1, len(word)))  # an earlier mutation may have left an empty word
     changed = draw.choice(
         (
             *[f"{key}={nasty}"] * 5,
@@ -253,7 +253,7 @@ def _mutate_words(words: list[str], cls: type[Section], draw: random.Random) -> 
 
 
 def _command_line(name: str, draw: random.Random) -> list[str]:
-    """Makes the words of a command; some of them are valid."""
+    """Makes the words of a command line: valid words with up to four mutations."""
     words = draw.choice(_SOUND[name]).split()
     for _ in range(draw.choice((0, 1, 1, 2, 4))):
         words = _mutate_words(words, LOADERS[name][1], draw)
@@ -264,7 +264,7 @@ def _command_line(name: str, draw: random.Random) -> list[str]:
 
 
 class _Hang(BaseException):
-    """Raised when a refusal takes too long."""
+    """Raised when a trial takes too long."""
 
 
 @contextlib.contextmanager
@@ -290,7 +290,7 @@ def _limited(folder: Path) -> Iterator[None]:
 
 
 def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Makes the settings of a command; returns the outcome and the message."""
+    """Makes the settings of a command in this process; returns the outcome and the message."""
     try:
         with _limited(folder):
             LOADERS[name][0](words)
@@ -309,7 +309,7 @@ def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
 
 
 def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Runs a command; returns the outcome and its message."""
+    """Runs a command in a separate process; returns the outcome and the message."""
     typed = [_kept_in(word) for word in words]
     try:
         done = subprocess.run(
@@ -336,13 +336,13 @@ def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
 
 
 def _spent() -> float:
-    """Returns the processor time of this process and of its finished children."""
+    """Returns the processor time of this process and of its finished children, s."""
     both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in both)
 
 
 def _kept_in(word: str) -> str:
-    """Keeps a word from writing outside the folder; removes characters that no process can get."""
+    """Replaces a path outside the folder; removes null characters, which no process can receive."""
     key, equals, value = word.partition("=")
     if value.strip("'\"").startswith(("/", "..")):
         value = "elsewhere"
@@ -354,7 +354,7 @@ def _limit_memory() -> None:
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Lets a command read mutated words and files.
+    """Runs a command on mutated words and files.
 
     Args:
       seed: seed of the mutations.

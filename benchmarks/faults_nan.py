@@ -1,9 +1,9 @@
-"""Campaign of `benchmarks.faults` that puts NaN or infinity into training between calls.
+"""A campaign of `benchmarks.faults` that puts NaN or infinity into training between calls.
 
-A trial trains a small run, puts NaN or an infinity somewhere before a random update, and continues
-training. There are three outcomes. `went on`: training continued. `goes back`: no more steps were
-taken, so the run returns to its checkpoint. `WRONG`: a non-finite number was learned, or an
-untouched arena changed.
+A trial trains a small run, puts NaN or an infinity into one array before a random update, and
+continues training. There are three outcomes. `went on`: training continued. `goes back`: the
+optimiser took no more steps, so the run returns to its checkpoint. `WRONG`: an update learned a
+non-finite number, or the fault changed an arena into which no value was put.
 """
 
 import functools
@@ -27,11 +27,11 @@ from swarmjax.training.loop import TrainState
 STAGES = ("s1", "s3")
 ARENAS, ROLLOUT, UPDATES = 64, 32, 100
 LAST = 20  # updates over which success is measured
-SEEDS = 4  # seeds of the undisturbed runs; the trials are spread over them
-SHARES = (0.01, 0.1, 1.0)  # shares of the arenas, or of a network's numbers, that are spoilt
+SEEDS = 4  # number of undisturbed runs per stage; every trial has the seed of one of them
+SHARES = (0.01, 0.1, 1.0)  # shares of the arenas, or of an array's numbers, that are spoilt
 VALUES = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf}
 HUGE = 1e30  # m; the reward stays finite, but its gradient does not
-# Targets of a fault in some arenas; `gradient` is spoilt by a reward whose square is infinite.
+# Arrays that a fault spoils in some arenas; `gradient` makes a reward whose square is infinite.
 IN_ARENAS = ("qpos", "qvel", "observation", "distance", "return", "gradient")
 IN_LEARNERS = ("params", "optimizer_state")
 KINDS = (*IN_ARENAS, *IN_LEARNERS)
@@ -41,7 +41,7 @@ class Stand(NamedTuple):
     """A program, compiled once for all trials of a process.
 
     Attributes:
-      train: (state, n) -> (state, metrics) of n updates; it does not change the given state.
+      train: (state, n) -> (state, metrics) of n updates; the given state does not change.
       start: seed -> the first state.
     """
 
@@ -81,19 +81,19 @@ def undisturbed(stage: str, seed: int) -> float:
 
 
 def success(metrics: dict[str, np.ndarray]) -> float:
-    """Returns the share of targets reached over the last updates."""
+    """Returns the share of targets reached over the last `LAST` updates."""
     return float(metrics["reached"][-LAST:].sum() / metrics["targets"][-LAST:].sum())
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Spoils one run.
+    """Puts one fault into a run, and judges how the training continues.
 
     Args:
       seed: Seed of the trial.
       folder: Folder of the trial; nothing is written.
 
     Returns:
-      What was spoilt, the outcome, and the share of targets at the end.
+      The entries of the line: the fault, the outcome, and the share of targets at the end.
     """
     del folder
     random = np.random.default_rng(seed)
@@ -130,7 +130,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def spoil_arenas(state: TrainState, kind: str, value: float, touched: np.ndarray) -> TrainState:
-    """Puts a value into the first robot of the touched arenas [A]."""
+    """Puts a value into the first number of an array in each touched arena [A]."""
     arenas = state.arenas
 
     def put(x: jax.Array, column: int = 0) -> jax.Array:
@@ -178,7 +178,7 @@ def judge(
       spoilt: The state with the fault.
       last: The state at the end of the run.
       metrics: [U] metrics of all updates since the fault.
-      alike: Whether the untouched arenas are equal to those of an undisturbed run.
+      alike: Whether the untouched arenas are equal to the same arenas of an undisturbed run.
     """
     if not alike:
         return "WRONG"

@@ -1,8 +1,9 @@
-"""Damages policy files and lets both readers read them: what does each accept, and at what cost?
+"""A campaign of `benchmarks.faults` that damages policy files and has both readers read them.
 
-NumPy also reads each accepted file, and a separate function computes the file's digest. If this
-digest differs from the one in the file, the outcome is WRONG. Memory is the peak that Python and
-NumPy allocate while a reader works.
+The campaign records which files each reader accepts, and how much time and memory each reader
+takes. NumPy also reads each accepted file, and a separate function computes the file's digest. If
+this digest differs from the digest in the file, the outcome is WRONG. The memory of a reader is the
+peak that Python and NumPy allocate while the reader works.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from swarmjax.policy import PolicyError
 from swarmjax.task import observation
 
 MOST_SECONDS = 1.0
-MOST_TIMES = 4  # limit of memory, in sizes of the file
+MOST_TIMES = 4  # memory limit, as a multiple of the file's size
 LEAST_LIMIT = 2**24  # bytes; this much memory is always allowed
 Readers = dict[str, Callable[[Path], Any]]
 READERS: Readers = {"load": policy.load, "read": policy_file.read}
@@ -33,11 +34,11 @@ _BIAS = "actor/hidden_0/bias.npy"
 
 
 def write_sound(path: Path, draw: random.Random) -> None:
-    """Writes a policy, shared or independent, small or of a megabyte.
+    """Writes a valid policy, shared or independent, small or larger than a megabyte.
 
     Args:
       path: path of the file.
-      draw: random source for its size and numbers.
+      draw: random source for the policy's size and numbers.
     """
     learners, hidden = draw.choice((1, 1, 5)), draw.choice(_SIZES)
     numbers = np.random.default_rng(draw.randrange(2**32))
@@ -88,7 +89,7 @@ def meta(learners: int) -> dict[str, Any]:
     }
 
 
-# Damage: from the content of a file to a damaged content
+# Kinds of damage: each function takes the content of a file and returns the damaged content
 
 
 def _flip(content: bytes, draw: random.Random) -> bytes:
@@ -142,7 +143,7 @@ def _double(content: bytes, draw: random.Random) -> bytes:
 
 
 def npy(dtype: str, shape: str) -> bytes:
-    """Writes the header of an array without its data.
+    """Returns the header of an array file, without the array's data.
 
     Args:
       dtype: type of the numbers, as NumPy writes it.
@@ -185,7 +186,7 @@ def _encrypt(content: bytes, draw: random.Random) -> bytes:
 
 
 def _say(content: bytes, draw: random.Random) -> bytes:
-    """Changes the file's metadata, with a correct or an incorrect digest."""
+    """Changes the file's metadata, and writes a correct or an incorrect digest."""
     arrays = _arrays(content)
     said = json.loads(str(arrays["meta"]))
     key = draw.choice(sorted(said))
@@ -213,7 +214,7 @@ def _foreign_digest(content: bytes, draw: random.Random) -> bytes:
 
 
 def _other_array(content: bytes, draw: random.Random) -> bytes:
-    """Replaces an array with another one, and corrects the digest."""
+    """Replaces an array with another array, and mostly corrects the digest."""
     arrays = _arrays(content)
     name = draw.choice(sorted(arrays.keys() - {"digest", "meta"}))
     array = arrays[name]
@@ -276,7 +277,7 @@ def _is_right(path: Path) -> bool:
 
 
 def is_sentence(text: str) -> bool:
-    """Tells whether a refusal is one line that a terminal can show.
+    """Tells whether a refusal is one short printable line that ends like a sentence.
 
     Args:
       text: text of the refusal.
@@ -285,7 +286,7 @@ def is_sentence(text: str) -> bool:
 
 
 class _Tried(NamedTuple):
-    """The result of reading a file: the message, the seconds, and the bytes of memory."""
+    """The result of reading a file: outcome, message, seconds, and peak memory in bytes."""
 
     outcome: str
     said: str
@@ -294,7 +295,7 @@ class _Tried(NamedTuple):
 
 
 def _try(read: Callable[[Path], Any], path: Path) -> _Tried:
-    """Reads a file."""
+    """Reads a file, and measures the seconds and the peak memory."""
     said = ""
     tracemalloc.start()
     began = time.perf_counter()
@@ -315,7 +316,7 @@ def _try(read: Callable[[Path], Any], path: Path) -> _Tried:
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Damages a policy file in one way and has both readers read it.
+    """Damages a policy file in one way and has both readers read the file.
 
     Args:
       seed: seed of the damage.

@@ -1,8 +1,8 @@
 """Campaigns of `benchmarks.faults` against whole runs: kills, signals, and damaged checkpoints.
 
-Every trial is a function of its seed and an empty folder, and returns the entries of its line. Runs
-are small: nine hundred updates of four arenas, with a checkpoint after each tenth of the budget.
-They are compared with an undisturbed run.
+Every trial is a function that takes a seed and an empty folder, and returns the entries of its
+line. The runs are small: 900 updates of four arenas, with a checkpoint after each tenth of the
+budget. Each run is compared with an undisturbed run.
 """
 
 import contextlib
@@ -39,12 +39,12 @@ WORDS = (
     "resume=auto",
 )
 INTERVAL = UPDATES // 10  # updates between two checkpoints
-KILLS = 4  # kills per run, before it may end
+KILLS = 4  # kills of a run before the run may end
 _POLL = 0.002  # s
 
 
 def train_command(run: Path) -> list[str]:
-    """Returns the words that start or resume a run."""
+    """Returns the command line that starts or resumes a run."""
     return [sys.executable, "-m", "swarmjax.train", *WORDS, f"run.dir={run}"]
 
 
@@ -71,7 +71,7 @@ class Undisturbed(NamedTuple):
 
 @functools.cache
 def undisturbed() -> Undisturbed:
-    """Trains without a disturbance, on this machine and next to its other work."""
+    """Trains a run without a disturbance; its times include the effect of the machine's load."""
     with tempfile.TemporaryDirectory() as folder:
         run, began = Path(folder) / "run", time.monotonic()
         process = start(run)
@@ -84,7 +84,7 @@ def undisturbed() -> Undisturbed:
 
 
 def _wait_for_updates(process: subprocess.Popen[str], run: Path) -> None:
-    """Waits until a run logs an update or ends. A resumed run first cuts its log."""
+    """Waits until a run ends or its log grows; a resumed run first makes its log shorter."""
     before = now = _size(run / directory.METRICS)
     while process.poll() is None and now <= before:
         time.sleep(_POLL)
@@ -92,12 +92,12 @@ def _wait_for_updates(process: subprocess.Popen[str], run: Path) -> None:
 
 
 def _size(file: Path) -> int:
-    """Returns the size of a file in bytes; 0 if there is none."""
+    """Returns the size of a file in bytes; 0 if the file does not exist."""
     return file.stat().st_size if file.exists() else 0
 
 
 def newest(run: Path) -> int:
-    """Returns the update of the newest complete checkpoint; 0 without one."""
+    """Returns the update of the newest complete checkpoint; 0 if there is no checkpoint."""
     return max(checkpoint.steps(run), default=0)
 
 
@@ -108,12 +108,12 @@ def logged(run: Path) -> list[int]:
 
 
 def kills(seed: int, folder: Path) -> dict[str, Any]:
-    """Kills a run `KILLS` times, then lets it end.
+    """Kills a run `KILLS` times, then resumes it until it ends.
 
-    One kill comes at any moment, one during training, one while a checkpoint is written, and one
-    within the first second after a resume.
+    One kill comes at a random moment, one during training, one while the run writes a checkpoint,
+    and one within the first second after a resume.
     """
-    undisturbed()  # called before the first start, since this call takes as long as a run
+    undisturbed()  # called before the first start, since the uncached call takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     moments, repeated = [], []
     for number in range(KILLS):
@@ -146,7 +146,7 @@ def _at_any_moment(process: subprocess.Popen[str], _: Path, random: np.random.Ge
 
 
 def _while_training(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
-    """Waits for the first logged update, then up to the training time of an undisturbed run."""
+    """Waits for the first logged update, then at most an undisturbed run's training time."""
     _wait_for_updates(process, run)
     known = undisturbed()
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -154,7 +154,7 @@ def _while_training(process: subprocess.Popen[str], run: Path, random: np.random
 
 
 def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.Generator) -> None:
-    """Waits until the writing of a randomly chosen later checkpoint begins, and a little longer."""
+    """Waits until the run writes one of its next three checkpoints, then at most 0.05 s longer."""
     left = int(random.integers(1, 4))
     seen: set[str] = set()
     while left and process.poll() is None:
@@ -168,7 +168,7 @@ def _while_saving(process: subprocess.Popen[str], run: Path, random: np.random.G
 def _in_the_first_second(
     process: subprocess.Popen[str], run: Path, random: np.random.Generator
 ) -> None:
-    """Waits until the process holds the lock of its run, and up to a second longer."""
+    """Waits until the process holds the lock of its run, then at most one second longer."""
     while process.poll() is None:
         with contextlib.suppress(OSError):
             if str(process.pid) in (run / directory.LOCK).read_text():
@@ -187,7 +187,7 @@ _MOMENTS: dict[str, Callable[[subprocess.Popen[str], Path, np.random.Generator],
 
 
 def is_whole(run: Path) -> dict[str, bool]:
-    """Compares a finished run with an undisturbed run."""
+    """Checks that a finished run has an undisturbed run's last state and a complete log."""
     with contextlib.suppress(CheckpointError, OSError, ValueError, KeyError):
         summary = json.loads((run / directory.SUMMARY).read_text())
         found = checkpoint.find(run)
@@ -199,23 +199,23 @@ def is_whole(run: Path) -> dict[str, bool]:
 
 
 def terms(seed: int, folder: Path) -> dict[str, Any]:
-    """Asks a run to stop, as a scheduler does; then lets it end.
+    """Sends a run a signal to stop, as a scheduler does; then resumes the run until it ends.
 
-    Two of three runs are asked while they train. The others are asked at any moment, most of them
-    while Python starts and the program is compiled.
+    Two of three runs get the signal while they train. The other runs get the signal at a random
+    moment, mostly while Python starts or while the program is compiled.
     """
-    undisturbed()  # called before the run starts, since this call takes as long as a run
+    undisturbed()  # called before the run starts, since the uncached call takes as long as a run
     random, run = np.random.default_rng(seed), folder / "run"
     number = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)[seed % 3]
     moment = "any" if seed // 3 % 3 == 0 else "training"
     process = start(run)
-    time.sleep(0.1)  # until Python handles signals; an earlier signal ends any program
+    time.sleep(0.1)  # until Python handles signals; an earlier signal would end any program
     _MOMENTS[moment](process, run, random)
     ended = process.poll() is not None
     process.send_signal(number)
     said, _ = process.communicate()
     wanted = 0 if ended else INTERRUPTED if number == signal.SIGINT else REQUEUE
-    # The budget may be spent before the signal is noticed.
+    # The run may spend its budget before it notices the signal.
     done = newest(run)
     code_is_right = process.returncode in ({wanted, 0} if done == UPDATES else {wanted})
     repeated = len([update for update in logged(run) if update >= done])
@@ -239,7 +239,7 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
 
 @functools.cache
 def _template() -> Path:
-    """Makes and keeps three runs with several checkpoints each; two of them share a config."""
+    """Trains and keeps three runs with several checkpoints each; two of the runs share a config."""
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
     more = ("run.keep_checkpoints=5",)
     for name, changed in (("mine", ()), ("twin", ()), ("other", ("algo.discount=0.9",))):
@@ -251,7 +251,7 @@ def _template() -> Path:
 
 
 def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
-    """Damages one or more checkpoints of a run; the newest intact one must be found."""
+    """Damages checkpoints of a run, and checks that the newest intact checkpoint is found."""
     random, run = np.random.default_rng(seed), folder / "mine"
     shutil.copytree(_template() / "mine", run)
     sound = {step: _digest_of(run, step) for step in checkpoint.steps(run)}
@@ -262,7 +262,7 @@ def checkpoints(seed: int, folder: Path) -> dict[str, Any]:
     try:
         kept = checkpoint.find(run)
         found: int | str = kept.update
-        # Damage without effect, for example in a file that is never read, is no error.
+        # Damage without effect is no error, for example damage to a file that is never read.
         wrong = sound.get(kept.update) != digest(kept.leaves) or (
             left is not None and kept.update < left
         )
@@ -283,7 +283,7 @@ def _digest_of(run: Path, step: int) -> str:
 
 
 def _newest(run: Path, random: np.random.Generator) -> list[Path]:
-    """Returns the folders of the newest one, two or three checkpoints."""
+    """Returns the folders of the newest checkpoints: one, two or three of them."""
     steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
     return [run / checkpoint.FOLDER / str(step) for step in steps]
 
@@ -293,7 +293,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _flip(run: Path, random: np.random.Generator) -> set[int]:
-    """Flips one bit in one file of each checkpoint."""
+    """Flips one bit in one file of each of the newest checkpoints."""
     for step in (chosen := _newest(run, random)):
         file = _files(step)[random.integers(len(_files(step)))]
         content = bytearray(file.read_bytes())
@@ -304,7 +304,7 @@ def _flip(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _cut(run: Path, random: np.random.Generator) -> set[int]:
-    """Truncates one file of each checkpoint."""
+    """Truncates one file of each of the newest checkpoints."""
     for step in (chosen := _newest(run, random)):
         file = _files(step)[random.integers(len(_files(step)))]
         content = file.read_bytes()
@@ -313,7 +313,7 @@ def _cut(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _delete(run: Path, random: np.random.Generator) -> set[int]:
-    """Deletes some files of each checkpoint."""
+    """Deletes some files of each of the newest checkpoints."""
     for step in (chosen := _newest(run, random)):
         for file in _files(step):
             if random.random() < 0.3:
@@ -322,7 +322,7 @@ def _delete(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _empty(run: Path, random: np.random.Generator) -> set[int]:
-    """Empties the folder of each checkpoint."""
+    """Empties the folder of each of the newest checkpoints."""
     for step in (chosen := _newest(run, random)):
         shutil.rmtree(step)
         step.mkdir()
@@ -330,7 +330,7 @@ def _empty(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _swap(run: Path, random: np.random.Generator) -> set[int]:
-    """Swaps two."""
+    """Swaps the folders of two checkpoints."""
     steps = random.choice(checkpoint.steps(run), 2, replace=False)
     first, second = (run / checkpoint.FOLDER / str(step) for step in steps)
     aside = run / checkpoint.FOLDER / "aside"
@@ -344,13 +344,13 @@ def _rename(run: Path, random: np.random.Generator) -> set[int]:
     """Gives a checkpoint the name of another update."""
     step = int(random.choice(checkpoint.steps(run)))
     new = int(random.integers(1, 10 * UPDATES))
-    with contextlib.suppress(OSError):  # a checkpoint of that name exists
+    with contextlib.suppress(OSError):  # if a checkpoint of that name exists
         (run / checkpoint.FOLDER / str(step)).rename(run / checkpoint.FOLDER / str(new))
     return {step, new}
 
 
 def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
-    """Replaces a checkpoint with one of another run."""
+    """Replaces a checkpoint with the checkpoint of the same update from another run."""
     step = int(random.choice(checkpoint.steps(run)))
     given = _template() / source / checkpoint.FOLDER / str(step)
     if given.exists():
@@ -361,7 +361,7 @@ def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _mix(run: Path, random: np.random.Generator) -> set[int]:
-    """Combines the arrays of one checkpoint with the description of another."""
+    """Combines the arrays of one checkpoint with the metadata of another checkpoint."""
     first, second = map(int, random.choice(checkpoint.steps(run), 2, replace=False))
     part = str(random.choice(["state", "meta"]))
     shutil.rmtree(run / checkpoint.FOLDER / str(first) / part)
@@ -372,7 +372,7 @@ def _mix(run: Path, random: np.random.Generator) -> set[int]:
 
 
 def _config(run: Path, _: np.random.Generator) -> set[int]:
-    """Replaces the run's config with that of another run."""
+    """Replaces the run's config with the config of another run."""
     shutil.copy(_template() / "other" / directory.CONFIG, run / directory.CONFIG)
     return set(checkpoint.steps(run))
 

@@ -1,14 +1,14 @@
-"""How realistic is the simulated robot? Compares it with numbers of the real or Webots robot.
+"""How realistic is the simulated robot? Compares it with the real robot and with Webots' robot.
 
 `python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
 prints one table. `out` writes JSON lines: first a line with versions and commit, then a line for
-each row. `docs` writes the table into DIR/robot.md, between its two markers, and plots into
-DIR/figures.
+each row. `docs` writes the table into DIR/robot.md, between the page's two markers, and writes
+plots into DIR/figures.
 
-Our numbers are read from the compiled model or from the robot's motion. The reference numbers are
-written here a second time, each with its source. If both sides took a number from the same line,
-the comparison would prove nothing. Where a source differs from Webots' own numbers, the error shows
-the spread between sources.
+Our numbers are read from the compiled model or from the simulated robot's motion. The benchmark
+writes the reference numbers down a second time, each with its source. If the robot and the
+reference took a number from the same line of code, the comparison would prove nothing. Where a
+source differs from Webots' own numbers, the error shows the spread between sources.
 """
 
 import itertools
@@ -49,12 +49,12 @@ class FidelityConfig(Section):
 
 
 def load(arguments: Sequence[str]) -> FidelityConfig:
-    """Makes the configuration from `key=value` words; raises ConfigError."""
+    """Makes the settings from `key=value` words; raises ConfigError if a word is invalid."""
     return build(FidelityConfig, files.values(files.split_words(FidelityConfig, arguments)))
 
 
 def rigs() -> list[Rig]:
-    """Puts the robots of configs/robot/ on rigs, in the order of `ROBOTS`."""
+    """Makes a rig for each robot in `ROBOTS`, in this order."""
     keys = (["policy=none", f"robot={name}"] for name in ROBOTS)
     return [rig.load(load_levels(EvaluateConfig, words).robot) for words in keys]
 
@@ -80,7 +80,7 @@ def measure(benches: Sequence[Rig]) -> list[Row]:
 
 
 def head() -> dict[str, Any]:
-    """Returns the first JSON line: the versions and the commit behind the rows."""
+    """Returns the first JSON line, with the versions and the commit that measured the rows."""
     return {
         "benchmark": "fidelity",
         "engine": "c",
@@ -104,7 +104,7 @@ def _cells(row: Row) -> list[str]:
 
 
 def _number(value: float | None) -> str:
-    """Writes a number with five digits; anything below 1e-12 is rounding error."""
+    """Writes a number with five significant digits; 0 below 1e-12, which is rounding error."""
     if value is None:
         return ""
     return "0" if abs(value) < 1e-12 else f"{value:.5g}"
@@ -112,7 +112,7 @@ def _number(value: float | None) -> str:
 
 def print_table(rows: Sequence[Row], console: Console) -> None:
     """Prints the rows, with one part of the table per section."""
-    if not console.is_terminal:  # a file can be wide
+    if not console.is_terminal:  # the lines of a file can be wide
         console.width = PLAIN_WIDTH
     table = Table(box=box.SIMPLE if console.is_terminal else None)
     for name in HEADS:
@@ -146,7 +146,7 @@ def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> Non
     Raises:
       ConfigError: if the page is missing, or has no place for the table.
     """
-    # Only the developers' tools include Matplotlib.
+    # Imported only here, since only the developers' tools include Matplotlib.
     from benchmarks import fidelity_figures
 
     path = folder / PAGE

@@ -35,7 +35,7 @@ def mass(bench: Rig) -> float:
 
 
 def yaw_inertia(bench: Rig) -> float:
-    """Returns the robot's moment of inertia about the vertical through its middle, kg m^2."""
+    """Returns the robot's moment of inertia about the vertical axis through its middle, kg m^2."""
     matrix = np.zeros((bench.model.nv, bench.model.nv))
     mujoco.mj_fullM(bench.model, rig.place(bench), matrix)
     turn = 2 if bench.robot.body == "planar" else 5
@@ -48,7 +48,7 @@ def centre(bench: Rig) -> np.ndarray:
 
 
 def cast(bench: Rig, origin: ArrayLike, direction: ArrayLike) -> float:
-    """Casts a ray, which may hit the robot itself; returns its length, m; -1 if nothing is hit."""
+    """Casts a ray, which may hit the robot itself; returns its length, m, or -1 without a hit."""
     start, toward = np.array(origin, float), np.array(direction, float)
     met = np.zeros(1, np.int32)
     return mujoco.mj_ray(bench.model, rig.place(bench), start, toward, rig.SEEN, True, -1, met)
@@ -57,7 +57,7 @@ def cast(bench: Rig, origin: ArrayLike, direction: ArrayLike) -> float:
 def contact_radius(bench: Rig) -> float:
     """Returns the radius at which the hull touches a wall, m.
 
-    The robot is placed about 1 mm too deep, and the engine reports the depth of the contact.
+    The robot is placed about 1 mm too deep in the wall. The engine reports the contact's depth.
     """
     face, asked = 0.5 * rig.SIDE, 0.037 - 0.001
     data = rig.place(bench, x=face - asked)
@@ -67,7 +67,7 @@ def contact_radius(bench: Rig) -> float:
 
 
 def lowest(bench: Rig, names: Sequence[str]) -> float:
-    """Returns the height of the lowest point of some spheres when the robot is put down, m."""
+    """Returns the height of the lowest point of the named spheres, with the robot put down, m."""
     data, model = rig.place(bench), bench.model
     geoms = [(data.geom(f"{BODY}_{n}").xpos[2], model.geom(f"{BODY}_{n}").size[0]) for n in names]
     return float(min(height - radius for height, radius in geoms))
@@ -108,8 +108,8 @@ def _inertia(both: Sequence[Rig]) -> list[Row]:
     model, unit = both[1].model, "kg m²"
     chassis, wheel = model.body(BODY), model.body(f"{BODY}_left").inertia
     about, whole = chassis.inertia, centre(both[1])
-    # Sum of the body's moment about z and those of two wheels: each has 5 g, is 0.026 m off the
-    # axis, and adds its own 5.1e-7.
+    # The moment about z is the sum of the body's moment and the moments of two wheels. Each wheel
+    # has 5 g, is 0.026 m off the axis, and adds its own moment of 5.1e-7 kg m².
     yaw = {PROTO: 9.78585e-5 + 2 * (0.005 * 0.026**2 + 5.1e-7)}
     height = {PROTO: (0.15 * 0.015 + 0.01 * 0.020) / 0.16}
     lying = "centre of mass without wheels, height"

@@ -34,7 +34,7 @@ def draw(folder: Path, planar: Rig, wheeled: Rig) -> None:
         "starts": _starts(planar, wheeled),
     }
     for name, plot in plots.items():
-        # Without Matplotlib's version, so that the same plot gives the same file.
+        # Leaves out Matplotlib's version, so that the same plot gives the same file.
         plot.savefig(folder / f"{name}.png", dpi=_DOTS, metadata={"Software": None})
 
 
@@ -47,7 +47,7 @@ def _figure(columns: int, rows: int = 1, height: float = 1.0) -> tuple[figure.Fi
 
 
 def _curves() -> figure.Figure:
-    """Draws counts over distance: four simulators, a real robot, and our two responses."""
+    """Draws infrared counts over distance, for four simulators, a real robot and our responses."""
     plot, (left, right) = _figure(2)
     distance = np.linspace(0.0, 0.08, 400)
     ours = fidelity_infrared.counts("webots", distance * math.cos(epuck.SENSOR_TILT))
@@ -94,7 +94,7 @@ def _fit() -> figure.Figure:
 
 
 def _commands(planar: Rig, wheeled: Rig) -> figure.Figure:
-    """Draws the speeds that commands result in, and how far ten commanded revolutions turn."""
+    """Draws realised speeds beside commands, and the turn in ten commanded revolutions."""
     plot, (left, right) = _figure(2)
     for (speed, turn), theirs in fidelity_motion.COMMANDS:
         left.annotate("", theirs, (speed, turn), arrowprops={"arrowstyle": "->", "alpha": 0.3})
@@ -134,7 +134,7 @@ def _turn(bench: Rig, track: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _starts(planar: Rig, wheeled: Rig) -> figure.Figure:
-    """Draws the distance that a start loses, and how a lagging motor follows."""
+    """Draws the distance that a robot loses at a start, and the speed of a motor with a lag."""
     plot, (left, right) = _figure(2)
     time, full = np.linspace(0.0, 0.128, 500), 0.1256
     for ramp, style in zip(fidelity_motion.RAMPS, ("-", "--"), strict=True):

@@ -19,8 +19,8 @@ from swarmjax.sim.response import Response, Wear
 
 HULL = 0.037  # m
 FREE = 67.19  # counts of Webots' sensor with nothing in sight
-# x (m), y (m), yaw (degrees) of ps0..ps7, and the distance to the hull along the ray (mm): Webots
-# E-puck, computed from its axis-angle rotations.
+# For each sensor ps0 to ps7: x (m), y (m), yaw (degrees), and the distance to the hull along the
+# ray (mm). Source: Webots E-puck, computed from its axis-angle rotations.
 POSES = (
     (0.030, -0.010, -17.235, 5.38),
     (0.022, -0.025, -45.883, 3.70),
@@ -31,8 +31,8 @@ POSES = (
     (0.022, 0.025, 45.791, 3.70),
     (0.030, 0.010, 17.143, 5.38),
 )
-# Length of a ray (m), counts, and their standard deviation as a share of the counts: Webots
-# E-puckDistanceSensor.
+# Length of a ray (m), counts, and the counts' standard deviation as a share of the counts. Source:
+# Webots E-puckDistanceSensor.
 TABLE = (
     (0.000, 4095.00, 0.00200),
     (0.005, 2133.33, 0.00300),
@@ -55,7 +55,8 @@ INVERSE = (
     (1000.0, 12.7),
     (1023.0, 12.6),
 )  # counts, length of a ray (mm)
-# Gap between the hull and a wall ahead (mm), counts of ps0 and of ps1, computed from the above.
+# Gap between the hull and a wall ahead (mm), counts of ps0, counts of ps1. The counts are computed
+# from `POSES` and `TABLE`.
 BEFORE_A_WALL = (
     (0, 1809.7, 356.6),
     (5, 994.4, 248.3),
@@ -69,8 +70,8 @@ BEFORE_A_WALL = (
     (50, 102.4, 67.2),
 )
 SIMULATORS: tuple[str, ...] = ("Webots", "GCtronic", "Enki", "ARGoS")
-# Distance (mm), then the counts of each simulator. The points from which the simulators measure the
-# distance are 3 to 6 mm apart.
+# Distance (mm), then the counts of each simulator. The simulators measure the distance from points
+# that are 3 to 6 mm apart.
 CURVES = (
     (5, 2133, 4095, 3501, 3706),
     (10, 1466, 2500, 2069, 3043),
@@ -80,7 +81,7 @@ CURVES = (
     (50, 120, 100, 100, 0),
     (70, 67, 51, 50, 0),
 )
-# Gap (cm), and counts minus the counts at 7 cm, as the mean over the eight measured sensors.
+# Gap (cm), then the counts minus the counts at 7 cm, as a mean over the eight measured sensors.
 NET = ((1, 957), (2, 292), (3, 115), (4, 48), (5, 23), (6, 9))
 SAMPLES = 100_000
 _RISE = math.cos(0.16)  # horizontal length of a ray divided by its length
@@ -106,20 +107,20 @@ def rows(planar: Rig, wheeled: Rig) -> list[Row]:
 
 
 def see(bench: Rig, gap: float) -> np.ndarray:
-    """Casts rays [K] (m) with MuJoCo from a robot that faces a wall.
+    """Casts the sensors' rays with MuJoCo, from a robot that faces a wall.
 
     Args:
       bench: the rig.
       gap: gap between hull and wall, m.
 
     Returns:
-      Horizontal distance from each sensor to what its ray hits; `inf` for nothing.
+      Horizontal distances [K] from the sensors to what their rays hit, m; `inf` without a hit.
     """
     place = _WALL - HULL - gap
     data = rig.place(bench, x=place)
     origin, direction = infrared.rays(np.array([place, 0.0, 0.0]), np)
     flat = np.zeros((epuck.SENSORS, 1))
-    # At the robot's current height above the floor.
+    # The sensors' height includes the robot's current height above the floor.
     height = flat + epuck.SENSOR_HEIGHT + data.body("robot0").xpos[2]
     toward = np.concatenate([direction, flat], axis=-1)
     reach, met = np.zeros(epuck.SENSORS), np.zeros(epuck.SENSORS, np.int32)
@@ -138,13 +139,13 @@ def counts(name: Response, ray: np.ndarray | float, sensor: int = 0) -> np.ndarr
 
 
 def at_gap(gap: np.ndarray, name: Response = "real") -> np.ndarray:
-    """Returns the counts [..., K] of the sensors with an object in front of each, at gaps [...]."""
+    """Returns the counts [..., K] of the sensors, each with an object ahead at gaps [...] (m)."""
     to_hull = np.array([way for *_, way in POSES]) * 1e-3
     return response.expected(name, np.asarray(gap)[..., None] + to_hull, np)
 
 
 def falls_to(reading: Callable[[float], float], level: float) -> float:
-    """Finds the largest distance (m), up to 0.1 m, where a falling reading exceeds a level."""
+    """Finds the largest distance, at most 0.1 m, at which a falling reading exceeds a level."""
     low, high = 0.0, 0.1
     while high - low > 1e-7:
         middle = 0.5 * (low + high)
@@ -175,7 +176,7 @@ def other_robot(length: float, reflectance: float) -> float:
 
 
 def analytic_error(benches: Sequence[Rig]) -> list[float]:
-    """Returns the largest difference of training's rays from MuJoCo's over the tested gaps, m."""
+    """Returns each rig's largest difference between training's and MuJoCo's rays at a wall, m."""
     found = []
     for bench in benches:
         worst = 0.0
@@ -268,7 +269,7 @@ def _reflectance() -> list[Row]:
 
 
 def noisy(name: Response, ray: float) -> np.ndarray:
-    """Returns readings [SAMPLES, K] of a ray (m), with noise from the simulation's generator."""
+    """Returns readings [SAMPLES, K] for a ray (m), with noise from the simulation's generator."""
     seeds = np.arange(SAMPLES, dtype=np.uint32)
     shape = (epuck.SENSORS,)
     normal = noise.normal(seeds, np.int32(1), Stream.INFRARED, shape, np).astype(float)
@@ -294,7 +295,7 @@ def _noise() -> list[Row]:
 def residuals() -> np.ndarray:
     """Returns measured minus fitted counts, [K, 8].
 
-    The fit's counts in free space are added, since zeroing the sensors had removed them.
+    Zeroing removes the fit's counts in free space from the response, so they are added again.
     """
     free = np.array(epuck.INFRARED_FIT)[:, 2]
     fitted = at_gap(np.array(epuck.MEASURED_GAPS)).T + free[:, None]

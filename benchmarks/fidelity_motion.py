@@ -35,17 +35,17 @@ FULL = 0.25, 0.0  # m/s, rad/s: more than the motors can reach
 TURN = 0.0, 3.14
 SPIN = 0.0, 100.0
 LAG = 0.05  # s
-# Time from rest to full speed, s: v / (mu g). If a skid without friction carries the load that the
-# start shifts back, the wheels push with mu m g / (1 + mu h / x): mass at h = 0.0153 m, skid at
-# x = 0.025 m.
+# Time from rest to full speed, s. The first value is v / (mu g). In the second value a skid without
+# friction carries the load that the start shifts back, so the wheels push with
+# mu m g / (1 + mu h / x). The mass is at h = 0.0153 m, and the skid is at x = 0.025 m.
 RAMPS = 0.1256 / 9.81, 0.1256 / 9.81 * (1 + 0.0153125 / 0.025)
 SPIN_UP = 3.14 * 1.0564e-4 / (0.16 * 9.81 * 0.026)  # s; time to a turn rate: w I / (mu m g L / 2)
 FINE = 0.0005  # s; a physics step that resolves a start of 8 to 21 ms
 REVOLUTIONS = 10
 TRACKS = 0.052, 0.057  # m
-# Command (m/s, rad/s), and the resulting motion with wheels of 0.02 m that are 0.052 m apart and
-# have a limit of 6.28 rad/s. Here left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, and
-# both are clipped.
+# Command v, w (m/s, rad/s), then the resulting motion (m/s, rad/s). The wheels have a radius of
+# 0.02 m and a limit of 6.28 rad/s, and are 0.052 m apart. Their speeds are
+# left = (v - 0.026 w) / 0.02 and right = (v + 0.026 w) / 0.02, both clipped to the limit.
 COMMANDS = (
     ((0.0, 3.14), (0.0, 3.14)),
     ((0.0625, 3.14), (0.05323, 2.78346)),
@@ -89,7 +89,7 @@ def wheel_speed(bench: Rig) -> float:
 
 
 def turning_ends(bench: Rig) -> float:
-    """Finds by bisection the commanded speed (m/s) above which a turn of 3.14 rad/s vanishes."""
+    """Finds by bisection the commanded speed (m/s) above which a turn of 3.14 rad/s is lost."""
     low, high = 0.1, 0.3
     while high - low > 1e-5:
         middle = 0.5 * (low + high)
@@ -110,7 +110,8 @@ def _speeds(first: Sequence[Rig], second: Sequence[Rig]) -> list[Row]:
     radius = [rolling_radius(each) for each in first]
     limits = {PROTO: 6.28, f"{FIRMWARE}, 1100 steps/s": 6.91}
     tops = {PROTO: 0.1256, ENKI: 0.128, XPUCK: 0.13, f"{FIRMWARE}, 1100 steps/s": 0.138}
-    # The old guide's value is also the paper's. The motors described in the guide cannot reach it.
+    # The old guide and the paper give the same top speed. The motors that the guide describes
+    # cannot reach this speed.
     tops[f"{GUIDE}, of old"] = 0.25
     ways = {PROTO: 0.020, "e-puck.gctronic.com": 0.02037, ARGOS: 0.02067}
     return [
@@ -127,7 +128,7 @@ def _turns(first: Sequence[Rig], second: Sequence[Rig]) -> list[Row]:
     far = [rig.load(replace(each.robot, effective_track=0.0569)) for each in first]
     limit, unit, wide = "in-place turn limit", "rad/s", [rig.steady(each, *SPIN)[1] for each in far]
     ends = "commanded speed above which no turn is left"
-    # Twice the speed of the rims over the track.
+    # The limit is twice the speed of the wheels' rims, divided by the track.
     closed, closed_v2, closed_wide = (
         {CLOSED: 2 * speed * 0.020 / track}
         for speed, track in ((6.28, 0.052), (7.536, 0.052), (6.28, 0.0569))
@@ -155,15 +156,15 @@ def _commands(both: Sequence[Rig]) -> list[Row]:
 
 
 def turned(bench: Rig, track: float) -> tuple[float, float, float]:
-    """Turns on the spot until ten revolutions are commanded.
+    """Turns a robot on the spot for ten commanded revolutions.
 
     Args:
       bench: the rig.
       track: effective track, m.
 
     Returns:
-      Ratio of realised to commanded turn; the effective track that follows from it, m; drift of the
-      robot's middle, m.
+      Ratio of realised to commanded turn; the effective track that follows from this ratio, m;
+      drift of the robot's middle, m.
     """
     bench = rig.load(replace(bench.robot, effective_track=track))
     asked = rig.command(bench, *TURN)
@@ -194,7 +195,7 @@ def _track(both: Sequence[Rig]) -> list[Row]:
 
 
 def start(bench: Rig, command: tuple[float, float], yaw: float = 0.0) -> Track:
-    """Runs a robot from rest with a fine time step and one command per step."""
+    """Runs a robot from rest at a constant command, for 400 steps of the rig."""
     return rig.run(bench, rig.place(bench, yaw=yaw), rig.command(bench, *command), 400)
 
 
@@ -213,13 +214,19 @@ def reach_time(bench: Rig, command: tuple[float, float], yaw: float = 0.0) -> fl
 
 
 def first_step(bench: Rig, command: tuple[float, float], axis: int) -> float:
-    """Returns the share of the steady speed (axis 0) or turn rate (2) in the first control step."""
+    """Returns the speed in the first control step, as a share of the steady speed.
+
+    Axis 0 gives the forward speed, and axis 2 gives the turn rate.
+    """
     pose = rig.run(bench, rig.place(bench), rig.command(bench, *command), 20).pose[:, axis]
     return float((pose[1] - pose[0]) / (pose[-1] - pose[-2]))
 
 
 def lagged(bench: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Returns time (s) and share of the speed [10] after each control step of a lagging motor."""
+    """Returns time (s) and share of the commanded speed [10] for a motor with a lag.
+
+    The robot starts from rest. The values hold after each of the first ten control steps.
+    """
     bench = rig.load(replace(bench.robot, motor_lag=LAG))
     data, wheels = rig.place(bench), rig.command(bench, 0.05, 0.0)
     share = rig.run(bench, data, wheels, 10).qvel[1:, 0] / 0.05
@@ -227,19 +234,19 @@ def lagged(bench: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lag_error(bench: Rig) -> float:
-    """Returns a lagging start's largest deviation from 1 - exp(-t / lag), as a share."""
+    """Returns the largest difference between a lagging motor's share and 1 - exp(-t / lag)."""
     time, share = lagged(bench)
     return float(np.abs(share + np.expm1(-time / LAG)).max())
 
 
 def pitch(track: Track) -> np.ndarray:
-    """Returns the pitch [T + 1] of a wheeled robot, degrees, nose down positive."""
+    """Returns the pitch [T + 1] of a wheeled robot, degrees; positive with the nose down."""
     w, x, y, z = track.qpos[:, 3:7].T
     return np.degrees(np.arcsin(2.0 * (w * y - z * x)))
 
 
 def pitch_play(bench: Rig) -> float:
-    """Returns the mean pitch at rest of a robot tilted to the front and to the back, degrees."""
+    """Returns the pitch at which a pushed robot rests, degrees: the mean of front and back."""
     angles = []
     for torque in (0.001, -0.001):  # N m; 0.04 N on a skid
         data = rig.place(bench)
@@ -249,7 +256,7 @@ def pitch_play(bench: Rig) -> float:
 
 
 def start_hop(bench: Rig) -> tuple[float, float]:
-    """Returns lift (m) and pitch (degrees) of a start at full speed, sampled at each step."""
+    """Returns the largest lift (m) and pitch (degrees) in a start at full speed, at any step."""
     bench = rig.load(bench.robot, bench.model.opt.timestep)
     track = rig.run(bench, rig.place(bench), rig.command(bench, *FULL), 40)
     height = track.qpos[:, 2]
@@ -272,7 +279,8 @@ def _starts(both: Sequence[Rig]) -> list[Row]:
 
 def _first_steps(both: Sequence[Rig]) -> list[Row]:
     ahead, turn = ([first_step(each, *way) for each in both] for way in ((FULL, 0), (TURN, 2)))
-    # Mean speed over the control step with constant acceleration at its start.
+    # The mean speed in a control step that begins with constant acceleration, as a share of the
+    # full speed.
     low, high, spin = ({CLOSED: 1 - 0.5 * time / 0.032} for time in (*RAMPS, SPIN_UP))
     way, touch = "first control step, share of full speed", "pitch before a skid touches"
     lag, (lift, tilt) = "motor with a lag of 50 ms, largest deviation", start_hop(both[1])
@@ -291,20 +299,21 @@ def _first_steps(both: Sequence[Rig]) -> list[Row]:
 
 
 def blocked(bench: Rig) -> Track:
-    """Drives at full speed into a wall from 2 cm away, for 4 s, sampled at each physics step."""
+    """Drives from 2 cm away into a wall for 4 s at full speed; samples each physics step."""
     bench = rig.load(bench.robot, bench.model.opt.timestep)
     data = rig.place(bench, x=0.5 * rig.SIDE - contact_radius(bench) - 0.02)
     return rig.run(bench, data, rig.command(bench, *FULL), round(4.0 / bench.control_step))
 
 
 def _wall(both: Sequence[Rig]) -> list[Row]:
-    tracks, late = [blocked(each) for each in both], slice(-60, None)  # end of a long push
+    tracks, late = [blocked(each) for each in both], slice(-60, None)  # last samples of the push
     depth = [each.pose[:, 0] + contact_radius(both[0]) - 0.5 * rig.SIDE for each in tracks]
     deepest, mean = [d.max() for d in depth], [d[late].mean() for d in depth]
     push, slips = [each.force[late].mean() for each in tracks], tracks[1].qvel[late, 6].mean()
     hop = tracks[1].qpos[:, 2].max() - tracks[1].qpos[0, 2]
     tilt = np.abs(pitch(tracks[1])).max()
-    # mu m g, and mu m g / (1 + mu h / x): wall contact at h = 0.015 m, a skid at x = 0.025 m.
+    # The push is mu m g, or mu m g / (1 + mu h / x) if a skid takes its share. The wall touches the
+    # robot at h = 0.015 m, and the skid is at x = 0.025 m.
     grip = {CLOSED: 0.16 * 9.81}
     shared = {CLOSED: 0.16 * 9.81 / (1 + 0.015 / 0.025)}
     return [
@@ -338,9 +347,10 @@ def _encoders(bench: Rig) -> list[Row]:
 
 
 def made(version: Literal["epuck1", "epuck2"], steps: float) -> float:
-    """Returns the steps per second that the firmware makes for a requested value."""
+    """Returns the steps per second that the firmware makes for a requested number."""
     turn = 2.0 * math.pi / motor.STEPS_PER_TURN
-    # Adds a millionth, since rounding could otherwise truncate a whole number to the one below.
+    # Adds a millionth of a step: without it, a rounding error could make the firmware truncate a
+    # whole number to the next lower one.
     return float(motor.quantise(np.float64((steps + 1e-6) * turn), version, np) / turn)
 
 

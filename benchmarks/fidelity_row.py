@@ -28,7 +28,8 @@ class Row(NamedTuple):
       section: section of the table.
       quantity: name of the quantity.
       unit: unit of all three numbers.
-      theirs: number of the real or Webots robot, or of a closed form; None if there is none.
+      theirs: reference number, for example of the real robot, of Webots or of a closed form; None
+        if there is no reference number.
       source: source of `theirs`.
       planar: measured number of our planar body; None if the quantity does not apply.
       wheeled: measured number of our wheeled body; None if the quantity does not apply.
@@ -51,7 +52,7 @@ class Row(NamedTuple):
         return max(abs(value - self.theirs) for value in ours) / abs(self.theirs)
 
     def line(self) -> dict[str, Any]:
-        """Returns the row for JSON."""
+        """Returns the row as plain data for JSON."""
         return self._asdict() | {"error": self.error}
 
 
@@ -62,14 +63,14 @@ def beside(
     theirs: Mapping[str, float | None],
     ours: Iterable[float | None],
 ) -> list[Row]:
-    """Makes rows that compare our numbers with those of several sources.
+    """Makes rows that compare our numbers with the numbers of several sources.
 
     Args:
       section: section of the table.
       quantity: name of the quantity.
       unit: unit of all numbers.
       theirs: reference numbers by source.
-      ours: [2] numbers of the planar and the wheeled body.
+      ours: [2] our numbers for the planar and for the wheeled body.
 
     Returns:
       A row for each source.

@@ -1,9 +1,9 @@
 """Makes animations of levels: `python -m benchmarks.gallery suite=worlds out=DIR policy=FILE`.
 
-It runs one level of each cell in MuJoCo's C engine and draws it from above as an animated WebP.
-Walls and boxes are black. Robots are discs with a line to the front. Targets are circles that fill
-on arrival. `policy` drives each cell, unless `who` names a baseline for it
-(`benchmarks.baselines`).
+The command runs one level of each cell in MuJoCo's C engine and draws the level from above as an
+animated WebP. Walls and boxes are black. Robots are discs with a line to the front. Targets are
+circles. A robot gets a white dot when it has arrived. The policy drives the robots of a cell,
+unless `who` names a baseline of `benchmarks.baselines` for this cell.
 """
 
 import math
@@ -43,7 +43,7 @@ _COLOURS = (
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryConfig(Section):
-    """What is drawn."""
+    """Settings: which levels to draw, and what drives the robots."""
 
     suite: str = field(default="worlds", metadata=about("a name of configs/suites/, or a file"))
     out: str = field(metadata=about("folder of the pictures, one for each cell"))
@@ -68,11 +68,11 @@ class GalleryConfig(Section):
 
 
 class Moment(NamedTuple):
-    """The robots' positions at one moment.
+    """The robots' poses at one moment.
 
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).
-      arrived: [R] whether each has arrived.
+      arrived: [R] whether each robot has arrived.
     """
 
     pose: np.ndarray
@@ -88,7 +88,7 @@ def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, 
       who: Baseline that drives; None for the policy.
 
     Returns:
-      The level and its moments, from the start.
+      The level, and its moments from the start to the end.
     """
     config, trained = _evaluation(settings, who)
     mine = trials.specialise(config, cell, config.policy)
@@ -113,7 +113,7 @@ def _frame(arenas: engine_c.Arenas) -> Moment:
 
 
 def _evaluation(settings: GalleryConfig, who: str | None) -> tuple[EvaluateConfig, Policy]:
-    """Reads the judge's settings, and the policy that drives or gives the range of commands."""
+    """Reads the judge's settings, and a policy that drives or only gives the range of commands."""
     words = [f"suite={settings.suite}"]
     if who is None:
         words.append(f"policy={settings.policy}")
@@ -130,7 +130,7 @@ def picture(level: Level, frame: Moment) -> Image.Image:
 
     Args:
       level: The level with everything that does not move.
-      frame: The robots' positions.
+      frame: The robots' poses.
 
     Returns:
       The picture.
@@ -166,7 +166,7 @@ def _draw_robot(
 
 
 def _pixel(x: float, y: float, scale: float) -> tuple[float, float]:
-    """Converts metres from the centre, y up, to pixels from the corner, y down."""
+    """Converts metres from the centre (y up) to pixels from the corner (y down)."""
     middle = 0.5 * SIZE * _FINE
     return middle + x * scale, middle - y * scale
 

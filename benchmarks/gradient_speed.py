@@ -2,9 +2,9 @@
 
 `python -m benchmarks.gradient_speed [batch=N,N] [tile=N,N] [programs=N,N] [warps=N,N] [key=value
 ...]` also takes the keys of `swarmjax.train`, of which only `algo.*` have an effect. For each batch
-it compiles autodiff and every launch of the kernels, and times them alternately. For each of them
-it prints a JSON line with the seconds per gradient and the difference from autodiff's gradient at
-the same and at full precision.
+size the command compiles the gradient with autodiff and with the kernels in every launch setting,
+and times these methods alternately. For each method it prints a JSON line. The line has the seconds
+per gradient, and the difference from autodiff's gradient at the same and at full precision.
 
 The time of a kernel gradient includes converting the networks to vectors and back, which learners
 do only once per update. With `algo.memory=gru` the samples are sequences as long as a rollout. With
@@ -40,14 +40,14 @@ from swarmjax.task import observation, surroundings
 from swarmjax.training import program as programs
 
 _STEP = 1e-6  # step along each gradient, so that no gradient can be reused
-_VALID = 0.75  # share of the samples
+_VALID = 0.75  # share of the samples that are valid
 
 Gradient = Callable[[Params, Minibatch], Params]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedConfig(Section):
-    """What is measured."""
+    """Settings: which batch sizes and launches to time, and how many calls."""
 
     batch: tuple[int, ...] = field(
         default=(1_310_720,), metadata=about("samples of the minibatch", 1, 10**9)
@@ -70,7 +70,7 @@ class SpeedConfig(Section):
 
 
 def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Minibatch:
-    """Draws samples with probability ratios near 1, so that some are clipped."""
+    """Draws samples with probability ratios near 1, so that some ratios are clipped."""
     keys = jax.random.split(key, 7)
     memory = networks.begin_memory(algo, (size // algo.rollout_length,))
     state = jax.random.normal(keys[6], (size, surroundings.SIZE))
@@ -90,7 +90,7 @@ def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Mi
 
 
 def methods(given: SpeedConfig, algo: AlgoConfig) -> dict[Launch | None, Gradient]:
-    """Makes the timed methods: autodiff without a launch, and the kernels with each launch."""
+    """Makes the methods to time: autodiff under None, and the kernels under each launch."""
     autodiff = jax.grad(losses.ppo_loss, has_aux=True)
     made: dict[Launch | None, Gradient] = {None: _of_samples(autodiff, algo)}
     if given.kernels != "none" and algo.memory == "none" and algo.critic == "observation":
@@ -132,7 +132,7 @@ def _compile(
 def _time(
     programs: Sequence[timing.TimedProgram], repeats: int, params: Params, samples: Any
 ) -> Any:
-    """Times the programs' calls alternately, s; the first call of each is a warm-up."""
+    """Times the programs' calls alternately, s; leaves out each program's first call, a warm-up."""
     taken: list[list[float]] = [[] for _ in programs]
     for _ in range(1 + repeats):
         for program, seconds in zip(programs, taken, strict=True):
@@ -144,13 +144,13 @@ def _time(
 
 
 def _difference(one: Params, other: Params) -> float:
-    """Returns the norm of the difference, divided by the norm of the second argument."""
+    """Returns the norm of the difference, divided by the norm of the second gradient."""
     apart = jax.tree.map(jnp.subtract, one, other)
     return float(optax.tree.norm(apart) / optax.tree.norm(other))
 
 
 def lines(given: SpeedConfig, algo: AlgoConfig, size: int) -> Iterator[dict[str, Any]]:
-    """Measures one size of the minibatch; yields one line per method."""
+    """Times all methods on one size of the minibatch; yields one line per method."""
     init_key, key = jax.random.split(jax.random.key(0))
     sizes = observation.SIZE, programs.ACTION_SIZE
     more = surroundings.SIZE if algo.critic == "state" else 0

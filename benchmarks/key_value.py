@@ -1,4 +1,4 @@
-"""Parses a benchmark's own words of the command line, among those of `swarmjax.train`."""
+"""Parses a benchmark's own arguments on a command line that it shares with `swarmjax.train`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,17 +8,17 @@ from swarmjax.config.section import keys
 
 
 def load(cls: type[Section], words: Sequence[str]) -> Any:
-    """Makes a config from `key=value` words; commas separate the values of a list.
+    """Makes a config from `key=value` arguments; commas separate the values of a list.
 
     Args:
       cls: class of the config.
-      words: words of the command line.
+      words: `key=value` arguments of the command line.
 
     Returns:
       An instance of `cls`.
 
     Raises:
-      ConfigError: if a word is invalid.
+      ConfigError: if an argument is invalid.
     """
     lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
     given = {}
@@ -31,17 +31,17 @@ def load(cls: type[Section], words: Sequence[str]) -> Any:
 
 
 def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:
-    """Makes a config from the words with its keys.
+    """Makes a config from the arguments whose keys it has, and returns the other arguments too.
 
     Args:
       cls: class of the config.
-      words: words of the command line.
+      words: `key=value` arguments of the command line.
 
     Returns:
-      An instance of `cls`, and the other words.
+      An instance of `cls`, and the other arguments.
 
     Raises:
-      ConfigError: if a word of `cls` is invalid.
+      ConfigError: if an argument with a key of `cls` is invalid.
     """
     known = section.names(cls)
     mine = [word for word in words if word.partition("=")[0] in known]

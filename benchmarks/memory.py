@@ -1,13 +1,13 @@
-"""How many bytes does an arena take on the GPU, and where?
+"""How much GPU memory does an arena take, and which allocator holds it?
 
 `python -m benchmarks.memory arenas=65536 [key=value ...]` takes the keys of `swarmjax.train`,
-trains for two updates and prints a JSON line with four numbers. They are the bytes in XLA's
-analysis of the compiled program, the peak of XLA's allocator, the peak of Warp's own allocator, and
-the drop in the GPU's free memory. XLA does not see what Warp allocates.
+trains for two updates and prints a JSON line with four sizes in bytes. They are the memory that the
+compiled program needs by XLA's analysis, the peak of XLA's allocator, the peak of Warp's own
+allocator, and the drop in the GPU's free memory. XLA's sizes do not include Warp's allocations.
 
 A peak covers a whole process, so measure one size per process. Set
-XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last number is the memory that XLA preallocates.
-On a CPU only the analysis is known.
+XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last size is the memory that XLA preallocates.
+On a CPU only the size in XLA's analysis is available.
 """
 
 import importlib.util
@@ -31,7 +31,7 @@ _UPDATES = 2
 
 
 def result(settings: TrainConfig) -> dict[str, Any]:
-    """Trains for two updates; returns the line."""
+    """Trains for two updates and returns the JSON line."""
     free = free_bytes()
     program, schedule = programs.load(settings)
     init = partial(seeds.init, program)
@@ -57,13 +57,13 @@ def result(settings: TrainConfig) -> dict[str, Any]:
 
 
 def free_bytes() -> int | None:
-    """Returns the free memory of the first NVIDIA GPU from Warp; None without GPU or Warp."""
+    """Asks Warp for the free bytes of the first NVIDIA GPU; None without a GPU or without Warp."""
     card = _card()
     return None if card is None else int(card.free_memory)
 
 
 def warp_bytes(settings: TrainConfig) -> int | None:
-    """Returns the peak memory of Warp's allocator; None if it is not used."""
+    """Returns the peak bytes of Warp's allocator; None if training does not use Warp on a GPU."""
     card = _card()
     if card is None or dispatch.resolve_impl(settings.sim.impl) != "warp":
         return None
@@ -73,7 +73,7 @@ def warp_bytes(settings: TrainConfig) -> int | None:
 
 
 def _card() -> Any:
-    """Returns Warp's first CUDA device; None without CUDA or Warp."""
+    """Returns Warp's first CUDA device; None without CUDA or without Warp."""
     if importlib.util.find_spec("warp") is None:
         return None
     import warp

@@ -1,8 +1,8 @@
 """Provides one arena of MuJoCo's C engine as an environment for trainers without JAX.
 
-The arena is the judge's (`swarmjax.evaluate.engine_c`), with the reward of `task.reward` in NumPy.
-The judge takes its actions from a policy. Here the policy has one learner per robot with zero
-weights, and its bias is the action.
+The judge in `swarmjax.evaluate.engine_c` simulates the arena. This file adds the reward of
+`task.reward`, in NumPy. The judge takes its actions from a policy, so this file wraps each action
+in a policy: one learner per robot, with zero weights and with the robot's action as bias.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ class Moved(NamedTuple):
 
     Attributes:
       observation: [R, O] observations.
-      reward: [R] rewards; 0 for a robot that had arrived before.
+      reward: [R] rewards; 0 for a robot that had arrived in an earlier step.
       arrived: [R] whether the robot has arrived.
       over: whether all robots have arrived, or the time is up.
     """
@@ -40,10 +40,10 @@ class Moved(NamedTuple):
 
 
 class MujocoArena:
-    """One arena; `reset` begins the next level, `step` takes a control step.
+    """A single arena: `reset` begins the next level, and `step` takes a control step.
 
     Attributes:
-      judge: everything that all levels share.
+      judge: the settings, the compiled model and other data that all levels share.
       arenas: [A=1] current state of the arena; None before the first level.
     """
 
@@ -86,7 +86,7 @@ class MujocoArena:
           action: [R, 2] actions; -1..1 spans the command's range, larger values are clipped.
 
         Returns:
-          The result. The arena must be reset if `over` is true.
+          The result of the step. If its `over` is true, `reset` must be called next.
         """
         before = self.arenas
         assert before is not None  # `reset` must be called first
@@ -128,12 +128,12 @@ def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
     """Computes the reward of a control step, as `task.reward` does in JAX.
 
     Args:
-      judge: everything that the arenas share.
+      judge: the data that the arenas share.
       before: [A] arenas before the control step.
-      after: [A] arenas after it.
+      after: [A] arenas after the control step.
 
     Returns:
-      [A, R] rewards; 0 for robots that had arrived before.
+      [A, R] rewards; 0 for robots that had arrived before the control step.
     """
     weights, active = judge.config.task.reward, ~before.outcome.arrived
     way = [observation.to_target(each.pose, each.target, np)[0] for each in (before, after)]
@@ -144,5 +144,5 @@ def rewards(judge: Judge, before: Arenas, after: Arenas) -> np.ndarray:
 
 
 def load_settings(words: list[str]) -> EvaluateConfig:
-    """Makes the settings of an arena from `key=value` words of `swarmjax.evaluate`."""
+    """Makes the settings of an arena from `key=value` arguments of `swarmjax.evaluate`."""
     return load_levels(EvaluateConfig, ["policy=none", *words])

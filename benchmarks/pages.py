@@ -4,19 +4,19 @@ from swarmjax.config import ConfigError
 
 
 def insert(text: str, page: str, marker: str, part: str) -> str:
-    """Puts a part between `<!-- marker -->` and `<!-- /marker -->`.
+    """Puts text between the markers `<!-- marker -->` and `<!-- /marker -->` of a page.
 
     Args:
       text: text of the whole page.
-      page: name of the page, for an error.
-      marker: the word in the markers.
+      page: name of the page, for error messages.
+      marker: the word inside both markers.
       part: text to put between the markers.
 
     Returns:
-      The new text.
+      The new text of the page.
 
     Raises:
-      ConfigError: if the page does not have both markers in order.
+      ConfigError: if a marker is missing, or the end marker comes before the begin marker.
     """
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     before, begun, rest = text.partition(begin)

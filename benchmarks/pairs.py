@@ -15,12 +15,12 @@ from swarmjax.training import program as programs
 
 
 class Arm:
-    """One program with its state; every call continues training.
+    """A training program with its state; every call continues the training.
 
     Attributes:
       settings: the program's config.
-      compile_s: seconds of compiling.
-      transitions: robot steps of the last call, over all seeds.
+      compile_s: compile time, s.
+      transitions: number of robot steps in the last call, summed over all seeds.
     """
 
     def __init__(self, settings: TrainConfig) -> None:
@@ -60,7 +60,7 @@ def time_in_turn(one: Arm, other: Arm, updates: int, pairs: int) -> list[tuple[f
 
 
 def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list[tuple[T, T]]:
-    """Calls two functions alternately; the one that comes first changes from pair to pair.
+    """Calls two functions in pairs, and swaps their order from pair to pair.
 
     Args:
       one: a function.
@@ -81,16 +81,16 @@ def in_turn[T](one: Callable[[], T], other: Callable[[], T], pairs: int) -> list
 def median(values: Sequence[float]) -> tuple[float, float, float]:
     """Returns the median and an interval with at least 95 % probability for the true median.
 
-    Of n independent values, the number that lie below the true median is distributed like the
-    number of heads in n coin tosses. This holds for any distribution of the values. The interval
-    runs from the k-th smallest to the k-th largest value, with the largest k that leaves at most
-    2.5 % on each side.
+    If the n values are independent, the number of values below the true median is distributed like
+    the number of heads in n coin tosses. This holds for any distribution of the values. The
+    interval runs from the k-th smallest to the k-th largest value. Here k is the largest number for
+    which the true median lies beyond either end with a probability of at most 2.5 %.
 
     Args:
       values: at least 6 values.
 
     Returns:
-      Median, lower and upper end.
+      The median, and the lower and the upper end of the interval.
     """
     ordered, n = sorted(values), len(values)
     below = np.cumsum([comb(n, heads) / 2**n for heads in range(n + 1)])

@@ -1,9 +1,10 @@
-"""How fast does BenchMARL train with IPPO on VMAS's navigation, in PyTorch?
+"""How fast does BenchMARL, which uses PyTorch, train VMAS's navigation scenario with IPPO?
 
-`python -m benchmarks.peer_benchmarl [arenas=4096] [device=cuda] ...` needs `torch-peers.txt` and
-prints a JSON line for each number of arenas. The line has the seconds of all iterations except the
-first two. An iteration is collecting and learning, without logging or evaluation. The task,
-networks, rollout, epochs and minibatches have our settings. All other settings are BenchMARL's own.
+`python -m benchmarks.peer_benchmarl [arenas=4096] [device=cuda] ...` needs the packages in
+`torch-peers.txt` and prints a JSON line for each number of arenas. The line has the seconds of all
+iterations except the first two. An iteration collects a rollout and learns from it, without logging
+or evaluation. The task, the networks, the rollout length, and the numbers of epochs and minibatches
+are those of swarmjax. All other settings are BenchMARL's defaults.
 """
 
 import contextlib
@@ -79,7 +80,7 @@ def experiment(
 
 
 def changes(config: BenchmarlConfig, arenas: int, device: str, folder: str) -> dict[str, Any]:
-    """Returns changes to BenchMARL's settings: batch, device, no files and no evaluation."""
+    """Returns our changes to BenchMARL's defaults: batch, device, no files and no evaluation."""
     frames = arenas * config.rollout
     return {
         "sampling_device": device,
@@ -102,7 +103,7 @@ def changes(config: BenchmarlConfig, arenas: int, device: str, folder: str) -> d
 
 
 def clock(torch: Any, ends: list[float]) -> Any:
-    """Makes the callback for the end of an iteration's learning."""
+    """Makes a callback that appends the time at the end of each iteration's learning to `ends`."""
 
     def note(self: Any, training_td: Any, group: str) -> None:
         if torch.cuda.is_available():
@@ -116,7 +117,7 @@ def clock(torch: Any, ends: list[float]) -> Any:
 
 
 def results(config: BenchmarlConfig) -> Iterator[dict[str, Any]]:
-    """Trains with every number of arenas; yields one line each."""
+    """Trains with each number of arenas, and yields a JSON line for each number."""
     torch = peers.find("torch", peers.TORCH)
     device = peers.torch_device(torch, config.device)
     for arenas in config.arenas:

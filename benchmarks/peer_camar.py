@@ -1,9 +1,10 @@
-"""How fast is CAMAR with differential drives, the most similar continuous path finder in JAX?
+"""How fast is CAMAR with differential drives?
 
+Among the JAX environments for path finding in continuous space, CAMAR is the most similar to ours.
 `python -m benchmarks.peer_camar [arenas=4096,65536] ...` needs the extra `camar` and prints a JSON
 line for each number of arenas. Each timed call is one compiled scan of `steps` control steps with
-random actions. Resets are CAMAR's own optimistic ones: each step draws one fresh map per
-`reset_ratio` arenas, and the arenas that end in this step share these maps.
+random actions. CAMAR's own wrapper resets arenas optimistically: each step draws one new map per
+`reset_ratio` arenas, and the arenas whose episodes end in this step share these maps.
 """
 
 import sys
@@ -20,7 +21,7 @@ from benchmarks.peers import PeerConfig
 from swarmjax import epuck, provenance
 from swarmjax.config import about
 
-FRAMESKIP = 2  # CAMAR's own default: three substeps
+FRAMESKIP = 2  # CAMAR's default; a control step has three substeps
 DT = 0.032 / (FRAMESKIP + 1)  # s
 CELLS = 6  # cells per side; they are 0.2 m wide, so the arena is 1.2 m wide
 COUNTED = {
@@ -66,7 +67,7 @@ def task(config: PeerConfig) -> dict[str, Any]:
 
 
 def results(config: CamarConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas; yields one line each."""
+    """Measures the speed with each number of arenas, and yields a JSON line for each number."""
     camar = peers.find("camar", "the extra camar")
     wrappers = peers.find("camar.wrappers", "the extra camar")
     for arenas in config.arenas:
@@ -95,7 +96,7 @@ def results(config: CamarConfig) -> Iterator[dict[str, Any]]:
 
 
 def _steps(world: Any, config: PeerConfig, carry: Any, _: None) -> tuple[Any, jax.Array]:
-    """Steps all arenas with random actions; returns a value that depends on every result."""
+    """Steps all arenas with random actions; also returns a sum that depends on every result."""
 
     def body(carry: Any, _: None) -> tuple[Any, jax.Array]:
         state, key = carry

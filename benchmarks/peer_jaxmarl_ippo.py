@@ -1,4 +1,4 @@
-"""How fast does JaxMARL train JaxNav with IPPO, with rollout and update in one program?
+"""How fast does JaxMARL's IPPO train on JaxNav, with rollout and update in one program?
 
 `python -m benchmarks.peer_jaxmarl_ippo [arenas=4096,16384] ...` needs the extra `jaxmarl` and
 prints a JSON line for each number of arenas.
@@ -6,9 +6,10 @@ prints a JSON line for each number of arenas.
 JaxMARL's scripts are not in its package and have no configuration for JaxNav. This file is a
 rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers of 64, one
 policy for all robots, a clipped value loss, advantages normalised in each minibatch, and samples
-shuffled individually. Learning rate, costs and clip are from the configuration of that file.
-Rollout, epochs and minibatches are ours, so batches have the same size. Episodes start from a pool
-of states, the best case of `benchmarks.peer_jaxnav`.
+shuffled individually. The learning rate, the costs and the clip range come from that script's
+configuration. The rollout length and the numbers of epochs and minibatches are those of swarmjax,
+so batches have the same size. Episodes start from a pool of states that were drawn beforehand, as
+in the best case of `benchmarks.peer_jaxnav`.
 """
 
 import sys
@@ -49,7 +50,7 @@ class IppoConfig(PeerConfig):
 
 
 class ActorCritic(nn.Module):
-    """Mean action, logarithm of its standard deviation, and value: [B, O] -> [B, U], [U], [B]."""
+    """Maps observations [B, O] to mean actions [B, U], log standard deviations [U], values [B]."""
 
     @nn.compact
     def __call__(self, seen: Array) -> tuple[Array, Array, Array]:
@@ -70,7 +71,7 @@ def _torso(seen: Array) -> Array:
 
 
 class Transition(NamedTuple):
-    """Observations, actions and their results, [T, B, ...] or [B, ...]."""
+    """The observations, actions and results of control steps, [T, B, ...] or [B, ...]."""
 
     seen: Array
     action: Array
@@ -81,7 +82,7 @@ class Transition(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """The changing state: parameters, optimiser, arenas, observations [A R, O], a random key."""
+    """The changing state: parameters, optimiser, arenas, observations [R A, O] and random key."""
 
     params: Any
     optimizer: Any
@@ -92,7 +93,7 @@ class Carry(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Ippo:
-    """The fixed parts of the program."""
+    """The parts of the training program that no update changes."""
 
     world: Any
     config: IppoConfig
@@ -119,7 +120,7 @@ def init(ippo: Ippo, pool: Pool) -> Carry:
 
 
 def _flat(ippo: Ippo, by_robot: dict[str, Array]) -> Array:
-    """Joins arrays [A, ...] of each robot, by name, to one array [R A, ...]."""
+    """Concatenates the arrays [A, ...] of all robots, given by name, to one array [R A, ...]."""
     return jnp.concatenate([by_robot[name] for name in ippo.world.agents])
 
 
@@ -154,7 +155,7 @@ def _step(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Transit
 
 
 def _advantages(path: Transition, last: Array) -> Array:
-    """Computes generalised advantages [T, B], backwards from the value [B] after the last step."""
+    """Computes generalised advantages [T, B]; `last` has the values [B] after the last step."""
 
     def back(carry: tuple[Array, Array], step: Transition) -> tuple[tuple[Array, Array], Array]:
         gae, following = carry
@@ -184,7 +185,7 @@ def _loss(network: ActorCritic, params: Any, sample: Sample) -> Array:
 
 
 def _epoch(ippo: Ippo, batch: Sample, progress: tuple[Any, Any], key: Array) -> tuple[Any, Array]:
-    """Trains one pass over all samples [B], shuffled individually."""
+    """Trains on all samples [B] once, in minibatches of individually shuffled samples."""
     order = jax.random.permutation(key, len(batch[1]))
     parts = jax.tree.map(
         lambda x: x[order].reshape(ippo.config.minibatches, -1, *x.shape[1:]), batch
@@ -201,7 +202,7 @@ def _epoch(ippo: Ippo, batch: Sample, progress: tuple[Any, Any], key: Array) -> 
 
 
 def update(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Array]:
-    """Runs one update, a rollout of all arenas and then the epochs; also returns the mean loss."""
+    """Runs one update: a rollout of all arenas, then the epochs. Also returns the mean loss."""
     carry, path = jax.lax.scan(partial(_step, ippo, pool), carry, length=ippo.config.rollout)
     last = _apply(ippo.network, carry.params, carry.seen)[2]
     advantage = _advantages(path, last)
@@ -216,7 +217,7 @@ def update(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Array]
 
 
 def results(config: IppoConfig) -> Iterator[dict[str, Any]]:
-    """Trains with every number of arenas; yields one line each."""
+    """Trains with each number of arenas, and yields a JSON line for each number."""
     world = peer_jaxnav.make(config)
     pool = peer_jaxnav.draw_pool(world, config.pool, config.seed)
     for arenas in config.arenas:

@@ -1,10 +1,11 @@
-"""How fast is JaxNav, JaxMARL's navigation of differential drives with range sensors?
+"""How fast is JaxNav, JaxMARL's environment of differential drives with range sensors?
 
 `python -m benchmarks.peer_jaxnav [arenas=4096,65536] [step=pool] ...` needs the extra `jaxmarl` and
-prints a JSON line for each number of arenas and each way to step. `pool` uses `step_env` with a
-pool of `pool` states that were drawn beforehand (JaxNav's best case). `default` uses JaxNav's own
-`step`. This function draws a whole map for every arena and step, and discards nearly all of these
-maps. Each timed call is one compiled scan of `steps` control steps with random actions.
+prints a JSON line for each number of arenas and each way to step. `step=pool` calls JaxNav's
+`step_env`, and restarts arenas from a pool of states that were drawn beforehand. This is JaxNav's
+best case. `step=default` calls JaxNav's own `step`, which draws a whole map for every arena and
+step, and discards nearly all of these maps. Each timed call is one compiled scan of `steps` control
+steps with random actions.
 """
 
 import sys
@@ -23,10 +24,11 @@ from swarmjax import epuck, provenance
 from swarmjax.config import about
 
 # JaxNav's cells are 1 m wide and its robots have a radius of 0.3 m, so our lengths are scaled by
-# 0.3 / 0.037. Our rays of 0.04 m become 0.32 m. Samples along them have the default spacing.
+# 0.3 / 0.037. Our rays of 0.04 m correspond to 0.32 m here. The samples along a ray have JaxNav's
+# default spacing of 0.05 m.
 RADIUS = 0.3
 BEAMS, RANGE, RESOLUTION = 8, 0.3, 0.05
-CELLS = 7  # cells per side; the outer ones are wall
+CELLS = 7  # cells per side; the outer cells are walls
 RESETS = {
     "pool": "one of a pool of states that were drawn beforehand, at random: its best case",
     "default": "a new map for every arena and step, used where an episode ends: its default",
@@ -73,7 +75,7 @@ def make(config: PeerConfig) -> Any:
 
 
 def results(config: JaxNavConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas and way to step; yields one line each."""
+    """Measures each number of arenas with each way to step, and yields a JSON line for each."""
     world = make(config)
     pool = draw_pool(world, config.pool, config.seed)
     for arenas in config.arenas:
@@ -100,13 +102,13 @@ def results(config: JaxNavConfig) -> Iterator[dict[str, Any]]:
 
 
 def draw_pool(world: Any, size: int, seed: int) -> tuple[Any, Any]:
-    """Draws observations and states [P] for the start of episodes."""
+    """Draws a pool of observations and states [P] at which episodes start."""
     keys = jax.random.split(jax.random.key(seed), size)
     return jax.jit(jax.vmap(world.reset))(keys)
 
 
 def begin(pool: tuple[Any, Any], arenas: int) -> tuple[Any, Any]:
-    """Takes the first observations and states [A] from the pool, in order."""
+    """Takes observations and states [A] from the pool in order, and starts over at its end."""
     index = jnp.arange(arenas) % len(jax.tree.leaves(pool)[0])
     return jax.tree.map(lambda x: x[index], pool)
 
@@ -114,18 +116,18 @@ def begin(pool: tuple[Any, Any], arenas: int) -> tuple[Any, Any]:
 def step(
     world: Any, how: str, pool: tuple[Any, Any], keys: Array, states: Any, actions: Any
 ) -> tuple[Any, Any, Any, Any, Any]:
-    """Steps all arenas in the way `how`, and resets ended ones.
+    """Steps all arenas, and resets the arenas whose episodes have ended.
 
     Args:
       world: the environment, JaxNav.
-      how: a key of `RESETS`.
+      how: the way to step and reset, a key of `RESETS`.
       pool: start states from `draw_pool`.
       keys: [A] random keys.
       states: [A] states.
-      actions: [A, 2] actions of each robot, by name.
+      actions: each robot's actions [A, 2], by the robot's name.
 
     Returns:
-      Results of JaxMARL's `step` for all arenas: observations, states, rewards, dones, infos.
+      The results of JaxMARL's `step`, [A]: observations, states, rewards, dones and infos.
     """
     if how == "default":
         return jax.vmap(world.step)(keys, states, actions)
@@ -144,7 +146,7 @@ def step(
 def _steps(
     world: Any, config: PeerConfig, how: str, carry: tuple[Any, Array], pool: Any
 ) -> tuple[tuple[Any, Array], Array]:
-    """Steps all arenas with random actions; returns a value that depends on every result."""
+    """Steps all arenas with random actions; also returns a sum that depends on every result."""
     arenas = len(jax.tree.leaves(carry[0])[0])
     low, high = jnp.array([0.0, -epuck.MAX_TURN_RATE]), jnp.array([1.0, epuck.MAX_TURN_RATE])
 

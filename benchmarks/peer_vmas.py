@@ -1,9 +1,10 @@
-"""How fast is VMAS's navigation scenario, the most similar swarm environment in PyTorch?
+"""How fast is VMAS's navigation scenario, the PyTorch environment most similar to ours?
 
-`python -m benchmarks.peer_vmas [arenas=4096,65536] [device=cuda] ...` needs `torch-peers.txt` and
-prints a JSON line for each number of arenas. It times calls of `steps` control steps with random
-actions drawn on the device. VMAS leaves resets to the caller, so timed calls have no resets, which
-is its best case. The line also has the time of a reset of all arenas.
+`python -m benchmarks.peer_vmas [arenas=4096,65536] [device=cuda] ...` needs the packages in
+`torch-peers.txt` and prints a JSON line for each number of arenas. It times calls of `steps`
+control steps with random actions drawn on the device. VMAS leaves resets to the caller, so the
+timed calls have no resets. This is VMAS's best case. The line also has the time for resetting all
+arenas.
 """
 
 import sys
@@ -36,7 +37,7 @@ class VmasConfig(PeerConfig):
 
 
 def scenario(config: PeerConfig) -> dict[str, Any]:
-    """Returns the task's settings for VMAS's navigation, in m; the arena is 1.2 m wide."""
+    """Returns the settings of VMAS's navigation, with lengths in m, for an arena 1.2 m wide."""
     return {
         "scenario": "navigation",
         "n_agents": config.robots,
@@ -54,7 +55,7 @@ def scenario(config: PeerConfig) -> dict[str, Any]:
 
 
 def results(config: VmasConfig) -> Iterator[dict[str, Any]]:
-    """Measures every number of arenas; yields one line each."""
+    """Measures the speed with each number of arenas, and yields a JSON line for each number."""
     torch, vmas = peers.find("torch", peers.TORCH), peers.find("vmas", peers.TORCH)
     device = peers.torch_device(torch, config.device)
     for arenas in config.arenas:

@@ -1,7 +1,8 @@
-"""Shares code between benchmarks of other projects: their settings, and the entries of their lines.
+"""Provides the settings and result entries that the benchmarks of other projects share.
 
-A peer is an optional extra, or is listed in `torch-peers.txt`. If a peer is missing, its benchmark
-prints one line with the reason as `skipped`, and exits with code 0.
+A peer is another project. A peer is installed as an optional extra of this package or from
+`torch-peers.txt`. If a peer is missing, its benchmark prints one line with the reason as `skipped`,
+and exits with code 0.
 """
 
 import importlib
@@ -44,7 +45,7 @@ def find(module: str, source: str) -> Any:
 
     Args:
       module: name of the module.
-      source: extra of pyproject.toml, or requirements file, that the peer comes from.
+      source: the extra of pyproject.toml, or the requirements file, that installs the peer.
 
     Returns:
       The module.
@@ -54,7 +55,7 @@ def find(module: str, source: str) -> Any:
     """
     try:
         return importlib.import_module(module)
-    except Exception as error:  # a half-installed library may raise anything
+    except Exception as error:  # a partly installed library may raise any exception
         reason = str(error).strip().partition("\n")[0].rstrip(".")
         raise MissingPeerError(
             f"{module} cannot be imported ({reason}): install {source}."
@@ -62,7 +63,7 @@ def find(module: str, source: str) -> Any:
 
 
 def run(name: str, main: Callable[[Sequence[str]], int], cls: type[Section]) -> int:
-    """Runs a peer's benchmark as `command.run` does; prints a `skipped` line without the peer."""
+    """Runs a benchmark with `command.run`; prints a `skipped` line if the peer is missing."""
 
     def run_or_skip(words: Sequence[str]) -> int:
         try:
@@ -82,20 +83,20 @@ def write(lines: Iterator[dict[str, Any]] | Sequence[dict[str, Any]]) -> None:
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Returns the versions of these packages in addition to `provenance.versions`."""
+    """Returns `provenance.versions` plus the versions of the given packages."""
     return provenance.versions() | {name: importlib.metadata.version(name) for name in packages}
 
 
 def speed(
     config: PeerConfig, arenas: int, substeps: int | None, calls_s: list[float]
 ) -> dict[str, Any]:
-    """Returns the entries of a line about an environment's speed.
+    """Returns the entries of a result line that describe an environment's speed.
 
     Args:
       config: settings of the measurement.
       arenas: number of arenas.
-      substeps: physics steps per control step; None if there are none.
-      calls_s: seconds of each call.
+      substeps: physics steps per control step; None if the environment has none.
+      calls_s: seconds of each timed call.
 
     Returns:
       Entries with the names in docs/interface.md.
@@ -115,7 +116,7 @@ def speed(
 
 
 def torch_device(torch: Any, wanted: str) -> str:
-    """Returns PyTorch's device; chooses one for `auto`."""
+    """Returns the device for PyTorch; `auto` means CUDA if it is available, else the CPU."""
     if wanted != "auto":
         return wanted
     return "cuda" if torch.cuda.is_available() else "cpu"

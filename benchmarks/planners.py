@@ -1,9 +1,10 @@
-"""Drives robots that know all positions and the map with local planners of `navground`.
+"""Drives robots with local planners of `navground`, which get exact positions and the map.
 
 The planners are `orca` (van den Berg et al. 2011, reciprocal collision avoidance), `hrvo` (Snape et
 al. 2011, hybrid reciprocal velocity obstacles), `hl` (Guzzi et al. 2013, human-like navigation) and
-`social_force` (Helbing & Molnar 1995). They follow the way-points of `benchmarks.way_points` within
-the limits of the robot's wheels. Arrived robots stand still and are obstacles for the others.
+`social_force` (Helbing & Molnar 1995). The robots follow the way-points of `benchmarks.way_points`
+within the limits of their wheels. Robots that have arrived stand still, and other robots treat them
+as static obstacles.
 """
 
 import importlib
@@ -19,8 +20,9 @@ from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.sim.drive import Drive
 
-# Settings that differ from the package's defaults, in m and s. The defaults are for pedestrians or
-# for robots several times as large and fast. Chosen on levels of s6 and crowd_dense with seed 7.
+# Settings that differ from navground's defaults, in m and s. The defaults are for pedestrians or
+# for robots several times as large and fast. The settings were chosen on levels of s6 and
+# crowd_dense with seed 7.
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
     "orca": ("ORCA", {"time_horizon": 2.0, "static_time_horizon": 0.5}),
     "hrvo": ("HRVO", {}),
@@ -29,15 +31,15 @@ SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 SAFETY = 0.004  # m; safety margin that a planner adds to the hull
 ROTATION = 0.2  # s; time in which a robot turns to its desired direction
-SIGHT = 0.4  # m; planners see robots and obstacles this far, 3.2 s of driving at full speed
+SIGHT = 0.4  # m; planners see robots and obstacles up to this distance, 3.2 s away at full speed
 
 
 class PlannersMemory(NamedTuple):
-    """The planners' knowledge of arenas.
+    """The data that the planners keep from one control step to the next.
 
     Attributes:
-      scene: [A] scenes.
-      pose: [A, R, 3] poses one control step ago, m and rad.
+      scene: [A] the arenas' scenes.
+      pose: [A, R, 3] robots' poses one control step ago, m and rad.
     """
 
     scene: np.ndarray
@@ -45,12 +47,12 @@ class PlannersMemory(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """The fixed parts of an arena.
+    """The paths, planners and obstacles of an arena, which do not change during an episode.
 
     Attributes:
       plan: the paths to the targets.
-      behavior: [R] planners of the package.
-      segment: [4, M] the outlines, as line segments of the package.
+      behavior: [R] each robot's planner, a `Behavior` of navground.
+      segment: [M] outlines of the obstacles, each a list of navground's line segments.
       centre: [M, 2] centres of the obstacles, m; the walls come last.
       radius: [M] radii of circles around the obstacles, m.
     """
@@ -64,7 +66,7 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class Planners:
-    """The controller of `engine_c.simulate`.
+    """A controller for `engine_c.simulate` that takes each robot's action from a planner.
 
     Attributes:
       name: a key of `SETTINGS`.
@@ -81,7 +83,7 @@ class Planners:
     control_step: float
 
     def init(self, arenas: Arenas) -> PlannersMemory:
-        """Returns the memory of arenas at their start."""
+        """Returns the planners' memory at the start of episodes."""
         scene = np.empty(len(arenas.pose), object)
         for i in range(len(scene)):
             parts = arenas.level.side[i], arenas.target[i], arenas.obstacle[i]
@@ -119,7 +121,7 @@ class Planners:
         return behavior
 
     def act(self, memory: PlannersMemory, arenas: Arenas) -> tuple[PlannersMemory, np.ndarray]:
-        """Takes one control step."""
+        """Computes the robots' actions for one control step."""
         gone = arenas.pose - memory.pose
         gone[..., 2] = (gone[..., 2] + np.pi) % (2.0 * np.pi) - np.pi
         distance = np.linalg.norm(arenas.target - arenas.pose[..., :2], axis=-1)
@@ -140,7 +142,7 @@ class Planners:
         target: np.ndarray,
         there: np.ndarray,
     ) -> np.ndarray:
-        """Computes the twists [R, 2] of one arena, m/s and rad/s; arrived robots stand still."""
+        """Computes the robots' speeds (m/s) and turn rates (rad/s), [R, 2]; 0 after arrival."""
         core, place = navground(), pose[:, :2]
         goal = way_points.way_points(scene.plan, place, target)
         apart = np.linalg.norm(place[:, None] - place, axis=-1) + np.where(
@@ -181,17 +183,17 @@ def navground() -> Any:
 
 
 def check_packages() -> None:
-    """Imports the packages of the extra.
+    """Imports the packages of the extra `navground`, to check that they are installed.
 
     Raises:
-      ConfigError: if one of them is missing.
+      ConfigError: if one of the packages is missing.
     """
     navground()
     way_points.scipy()
 
 
 def load(name: str, judge: Judge) -> Planners:
-    """Makes the controller of a judge's robots."""
+    """Makes the controller for a judge's robots; `name` is a key of `SETTINGS`."""
     task, robot = judge.config.task, judge.config.robot
     return Planners(name, judge.drive, robot.hull_radius, task.target_radius, task.control_step)
 
@@ -207,7 +209,7 @@ _CORNERS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 
 
 def _segments(core: Any, box: np.ndarray) -> list[Any]:
-    """Returns the outline of a box [5]; a wall has one side."""
+    """Returns the outline of a box [5] as line segments; a wall is a single segment."""
     cos, sin = np.cos(box[2]), np.sin(box[2])
     corner = box[:2] + (_CORNERS * box[3:]) @ np.array([[cos, sin], [-sin, cos]])
     if not box[3:].all():

@@ -1,11 +1,14 @@
-"""Where does the time of an update go: physics, sensors, policy, learning?
+"""How is the time of an update divided among physics, sensors, policy and learning?
 
 `python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`. It
-traces one call each of physics alone, of the environment including physics, and of training
-including both. For each of the `top` kernels of a call it prints a JSON line, with the microseconds
-per control step of all arenas and the share of all kernels' time. On a GPU these are the kernels of
-its streams. On a CPU they are XLA's operations, summed over all threads. `busy` is the time of all
-kernels divided by the time of the call. It is above 1 if several threads or streams ran at once.
+traces three calls: physics alone, the environment including physics, and training including both.
+For each call it prints a JSON line for all kernels together, and a line for each of the `top`
+slowest kernels. A line has the microseconds per control step of all arenas. A kernel's line also
+has the kernel's share of the time of all kernels.
+
+On a GPU, the kernels are those of the GPU's streams. On a CPU, the kernels are XLA's operations,
+and their times are summed over all threads. `busy` is the time of all kernels divided by the time
+of the call. `busy` is above 1 if several threads or streams ran at once.
 """
 
 import json
@@ -28,10 +31,11 @@ from swarmjax import command
 from swarmjax.run.settings import TrainConfig, load_train
 
 TOP = 40
-UPDATES = 2  # updates in the call of training
-# Parts of the names of threads and streams with kernels, by platform.
+UPDATES = 2  # number of updates in the traced call of training
+# Kernels run on the threads or streams whose names contain this text, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
-# Events that only mark the ends of a region, and loops, whose contents are counted separately.
+# Prefixes of events that are not counted: some only mark the end of a region, and a loop's contents
+# are counted separately.
 MARKERS = ("ThreadpoolListener", "ThunkExecutor", "end: ", "while")
 KINDS = {
     "warp": ("_cuda_kernel", "wp_"),
@@ -42,7 +46,7 @@ KINDS = {
 
 
 def kind(name: str) -> str:
-    """Guesses from a kernel's name what the kernel does: a key of `KINDS`, or `fusion`."""
+    """Guesses a kernel's kind from the kernel's name: a key of `KINDS`, or `fusion`."""
     return next((k for k, marks in KINDS.items() if any(m in name for m in marks)), "fusion")
 
 
@@ -50,10 +54,10 @@ def kernels(call: Callable[[], Any]) -> tuple[dict[str, float], Counter[str], fl
     """Traces a call that has been compiled and run before.
 
     Args:
-      call: the call; it returns arrays.
+      call: the function to call; it returns arrays.
 
     Returns:
-      Seconds by kernel, how often each ran, and the seconds of the call.
+      The seconds of each kernel, the number of runs of each kernel, and the seconds of the call.
     """
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
@@ -69,7 +73,7 @@ def kernels(call: Callable[[], Any]) -> tuple[dict[str, float], Counter[str], fl
 
 
 def _events(folder: Path) -> Iterator[tuple[str, float]]:
-    """Yields the kernels of a trace and their seconds."""
+    """Yields the name and the seconds of each run of a kernel in a trace."""
     mark = LINES[jax.default_backend()]
     for path in folder.rglob("*.xplane.pb"):
         for plane in jax.profiler.ProfileData.from_file(str(path)).planes:
@@ -86,13 +90,14 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
     """Profiles a call.
 
     Args:
-      about: entries of every line.
-      call: the call, which has run before; it returns arrays.
+      about: entries that every line has.
+      call: the function to call, which has run before; it returns arrays.
       steps: control steps per call.
       top: number of kernels to list.
 
     Returns:
-      A line for all kernels together, by kind, and one for each of the slowest kernels.
+      A line for all kernels together, with the share of each kind, and a line for each of the
+      slowest kernels.
     """
     spent, count, seconds = kernels(call)
     total = sum(spent.values())
@@ -120,7 +125,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
 
 
 def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
-    """Sorts by time, the longest first."""
+    """Sorts kernels or kinds by their seconds, the slowest first."""
     return sorted(seconds.items(), key=operator.itemgetter(1), reverse=True)
 
 

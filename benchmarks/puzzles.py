@@ -1,12 +1,13 @@
-"""Makes arenas of POGEMA's 16 puzzles: `python -m benchmarks.puzzles out=FILE.npz`.
+"""Makes arenas from POGEMA's 16 puzzles: `python -m benchmarks.puzzles out=FILE.npz`.
 
-It writes a suite with three cells `r2`, `r3` and `r4`, named by the number of robots, with ten
-draws of starts and targets for each puzzle. It prints a JSON line for each cell with the number of
-levels that can be solved on the grid. `python -m swarmjax.evaluate suite=FILE.npz
+It writes a suite of three cells, `r2`, `r3` and `r4`, named after their numbers of robots. A cell
+has ten draws of starts and targets for each puzzle. For each cell it prints a JSON line with the
+number of levels that can be solved on the grid. `python -m swarmjax.evaluate suite=FILE.npz
 task.arrival=hold policy=...` and `python -m benchmarks.baselines suite=FILE.npz task.arrival=hold`
 read the file.
 
-The layouts, the numbers of robots and the number of draws are POGEMA's. The draws are our own.
+The layouts, the numbers of robots and the number of draws come from POGEMA. The starts and targets
+are drawn by this file.
 """
 
 import json
@@ -29,26 +30,27 @@ from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig, complete
 
 LAYOUTS = Path(__file__).parent / "maps" / "puzzles.yaml"
-ROBOTS, DRAWS = (2, 3, 4), 10  # from their file 05-puzzles.yaml
-# Edge of a cell, m; less than the 0.148 m of two hulls side by side. In a bend two robots can pass
-# with 6 mm to spare if one is in the outer corner. Cells below 0.1155 m would prevent this.
+ROBOTS, DRAWS = (2, 3, 4), 10  # from POGEMA's file 05-puzzles.yaml
+# Edge of a cell, m. The edge is less than the 0.148 m that two hulls need side by side. In a bend,
+# two robots can still pass with 6 mm to spare if one robot is in the outer corner. With an edge
+# below 0.1155 m, robots could not pass in a bend either.
 EDGE = 0.12
-# POGEMA allows 128 steps on the grid. At 0.1256 m/s this takes 122.3 s, or 3,822 control steps of
-# 0.032 s. Turning takes extra time. But no level here needs more than 24 of the 128 steps, so a
-# robot has five times as long as it would need at full speed.
+# POGEMA allows 128 steps on the grid. At 0.1256 m/s, 128 cells take 122.3 s, or 3,822 control steps
+# of 0.032 s. Turning takes extra time, but no level here needs more than 24 of the 128 steps. A
+# robot therefore has five times as long as it needs to drive these steps at full speed.
 STEPS = 4000
 SEED = SUITE_SEED + 400
 _SHIFTS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 
-Place = tuple[int, int]  # row and column of a layout, from 0
+Place = tuple[int, int]  # row and column in a layout, both counted from 0
 
 
 class Draw(NamedTuple):
-    """A puzzle with starts and targets.
+    """A puzzle with the starts and targets of its robots.
 
     Attributes:
       number: number of the level in its cell.
-      rows: rows of the layout, with `#` for blocked and `.` for free.
+      rows: rows of the layout; `#` marks a blocked place, `.` a free place.
       start: [R] places of the robots, all different.
       target: [R] places of their targets, all different.
     """
@@ -80,7 +82,7 @@ class PuzzlesConfig(Section):
 
 
 def layouts() -> dict[str, tuple[str, ...]]:
-    """Reads the rows of the puzzles, by name."""
+    """Returns the rows of each puzzle's layout, by the name of the puzzle."""
     return {name: tuple(text.split()) for name, text in files.read_yaml(LAYOUTS).items()}
 
 
@@ -88,14 +90,15 @@ def layouts() -> dict[str, tuple[str, ...]]:
 
 
 def near(rows: Sequence[str]) -> tuple[list[Place], np.ndarray]:
-    """Lists the places where a robot can be, and those it can reach in one step.
+    """Lists the free places of a layout, and the neighbours of each place.
 
     Args:
       rows: rows of a layout.
 
     Returns:
-      The N free places, row by row. Also [N, 5]: each place's own number and the numbers of its
-      neighbours below, above, right and left, with -1 for a missing neighbour.
+      The N free places, row by row, and an array [N, 5] of place numbers. A row of the array has
+      the place's own number and the numbers of its neighbours below, above, right and left, with
+      -1 for a missing neighbour.
     """
     place = [(r, c) for r, row in enumerate(rows) for c, x in enumerate(row) if x != maps.WALL]
     number = {each: i for i, each in enumerate(place)}
@@ -108,14 +111,14 @@ def fewest_steps(draw: Draw) -> int | None:
 
     The rules are those of multi-agent path finding (Stern et al. 2019, section 2.2). In each step a
     robot stays or moves to a neighbouring place. No two robots may be in one place or swap places.
-    A robot may move to a place that another one leaves. All must be at their targets at the same
-    time.
+    A robot may move to a place that another robot leaves in the same step. All robots must be at
+    their targets at the same time.
 
     Args:
       draw: the puzzle.
 
     Returns:
-      Steps of the fastest solution; None if there is none.
+      Number of steps of the shortest solution; None if the puzzle has no solution.
     """
     place, beside = near(draw.rows)
     shape = (len(place),) * len(draw.start)
@@ -136,7 +139,7 @@ def fewest_steps(draw: Draw) -> int | None:
 
 
 def _successors(state: np.ndarray, beside: np.ndarray) -> Any:
-    """Returns numbers [K] of the states that can follow states [F, R], robot by robot."""
+    """Builds, robot by robot, the states that can follow states [F, R]; returns their numbers."""
     before, after = state, state[:, :0]
     for robot in range(state.shape[1]):
         row, option = np.nonzero(beside[before[:, robot]] >= 0)
@@ -153,12 +156,12 @@ def draw_puzzle(number: int, rows: Sequence[str], robots: int) -> Draw:
     """Draws starts and targets; each target is reachable from its start and differs from it.
 
     Args:
-      number: number of the level.
+      number: number of the level in its cell.
       rows: rows of the layout.
       robots: number of robots.
 
     Returns:
-      The puzzle, drawn uniformly from all valid ones.
+      The puzzle; all valid pairs of starts and targets are equally likely.
     """
     place, beside = near(rows)
     part, random = _parts(beside), _random(robots, number)
@@ -174,7 +177,7 @@ def _random(*key: int) -> np.random.Generator:
 
 
 def _parts(beside: np.ndarray) -> np.ndarray:
-    """Labels the connected parts of a layout: each place gets the lowest place of its part."""
+    """Labels the connected parts of a layout: each place gets the lowest number in its part."""
     part = np.arange(len(beside))
     for _ in beside:
         part = np.where(beside >= 0, part[beside], len(beside)).min(axis=-1)
@@ -214,7 +217,7 @@ def to_level(draw: Draw, edge: float, boxes: int) -> Level:
 
 
 def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps.Map:
-    """Reads a layout as a map for one robot, since one place may be both a start and a target."""
+    """Reads a layout as a map with one robot, since one robot's target may be another's start."""
     letters = [list(row) for row in rows]
     for (r, c), letter in ((start, "a"), (target, "A")):
         letters[r][c] = letter
@@ -222,12 +225,11 @@ def _read(rows: Sequence[str], start: Place, target: Place, edge: float) -> maps
 
 
 def draw_puzzles(robots: int, draws: int) -> list[Draw]:
-    """Draws the puzzles of a cell, layout by layout.
+    """Draws the puzzles of one cell of the suite, layout by layout.
 
     Args:
       robots: number of robots.
-      draws: number of draws per layout, up to `DRAWS`. A smaller number gives the first draws of a
-        larger number.
+      draws: number of draws per layout. Calls with at most `DRAWS` draws share their first draws.
 
     Returns:
       The puzzles.
@@ -240,14 +242,15 @@ def draw_puzzles(robots: int, draws: int) -> list[Draw]:
 
 
 def make_cell(puzzles: Sequence[Draw], edge: float) -> Cell:
-    """Makes a cell of puzzles with the same number of robots.
+    """Makes a cell of the suite from puzzles with the same number of robots.
 
     Args:
       puzzles: puzzles of the cell.
       edge: edge of a cell of the grid, m.
 
     Returns:
-      The cell. Its stage is the layout with the most walls; each level has its own layout.
+      The cell. The stage of the cell has the layout with the most walls, but each level has its own
+      layout.
     """
     robots = len(puzzles[0].start)
     stage = max((_stage(each.rows, robots, edge) for each in puzzles), key=lambda x: x.obstacles)
@@ -258,7 +261,7 @@ def make_cell(puzzles: Sequence[Draw], edge: float) -> Cell:
 
 
 def _stage(rows: Sequence[str], robots: int, edge: float) -> StageConfig:
-    """Makes the stage of a layout: starts in the upper half of its free places, targets below."""
+    """Makes a layout's stage: the upper half of the free places are starts, the rest targets."""
     place, _ = near(rows)
     letters = [list(row) for row in rows]
     for i, (r, c) in enumerate(place):
@@ -281,7 +284,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _line(cell: Cell, puzzles: Sequence[Draw]) -> dict[str, object]:
-    """Counts the levels of a cell that can be solved on the grid, and their steps."""
+    """Makes a cell's JSON line, with its solvable levels and the fewest steps that solve them."""
     steps = [fewest_steps(each) for each in puzzles]
     solved = [each for each in steps if each is not None]
     return {

@@ -1,30 +1,32 @@
-"""Which one brings the same swarm to its targets sooner, our trainer or Brax's PPO?
+"""With which PPO does the same swarm learn to reach its targets sooner, swarmjax's or Brax's?
 
 `python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]` takes the
-keys of `swarmjax.train` and prints a JSON line for each seed. Both train on the same compiled
-environment, with the same networks, batch, minibatches, epochs, discount, clip, costs and gradient
-clipping. Initial weights are also equal, except for the critic's last layer. Both are judged with
-the policy's mean action on the same levels, at `points` points evenly spaced over the budget.
+keys of `swarmjax.train` and prints a JSON line for each seed. Both trainers use the same compiled
+environment, with the same networks, batch, minibatches, epochs, discount, clip range, costs and
+gradient clipping. They also initialise weights in the same way, except in the critic's last layer.
+The policies of both are judged with their mean actions on the same levels, at `points` points
+evenly spaced over the budget.
 
 Brax differs in these points:
 
 - one constant learning rate for actor and critic (`learning_rate`, by default our actor's);
 - Adam's epsilon;
-- a critic whose last layer starts as large as the others (Brax has one initialisation for all);
+- a critic whose last layer starts with weights as large as those of the other layers, since Brax
+  has one initialisation for all of them;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
 - no compiler options for XLA (`loop.compiler_options`);
-- no mask, so arrived robots stay in its batch (docs/adapters.md).
+- no mask, so robots that have arrived stay in its batch (docs/adapters.md).
 
 All of Brax's robot steps count as transitions. Our trainer's transitions are only the robot steps
 that it learns from.
 
-`settings=playground` gives Brax the settings of MuJoCo Playground for its walking robots
+`settings=playground` gives Brax the settings that MuJoCo Playground uses for walking robots
 (`PLAYGROUND`) instead of ours. The networks stay the same.
 
-Seconds are training time alone. Brax compiles within its first two calls. Each of these two calls
-counts as the median time of the other calls, and the rest of its time as compile time. Judging is
-not timed.
+The reported seconds are training time alone. Brax compiles during its first two calls. For each of
+these two calls, the median time of the later calls counts as training, and the rest of the call
+counts as compiling. Judging is not timed.
 """
 
 import math
@@ -50,7 +52,7 @@ from swarmjax.run.settings import TrainConfig, load_train
 
 SHARES = (0.90, 0.95)
 # From MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`. Its minibatches
-# hold 256 of 8,192 robots. Other settings are the defaults of Brax 0.14.2.
+# hold 256 of 8,192 robots. Settings that Playground leaves out are the defaults of Brax 0.14.2.
 PLAYGROUND: dict[str, Any] = {
     "unroll_length": 20,
     "num_minibatches": 32,
@@ -63,12 +65,12 @@ PLAYGROUND: dict[str, Any] = {
     "learning_rate": 3e-4,
     "max_grad_norm": 1.0,
 }
-# Names of Brax in tables, by `settings`.
+# Names of Brax's results in tables, by the value of `settings`.
 BRAX = {
     "ours": "Brax PPO, this environment",
     "playground": "Brax PPO as MuJoCo Playground sets it, this environment",
 }
-_COMPILING = 2  # calls of Brax that may compile; the second takes the results of the first
+_COMPILING = 2  # Brax may compile in this many first calls; the second takes the first's results
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
 
@@ -94,13 +96,13 @@ class RaceConfig(Section):
 
 
 class Course(NamedTuple):
-    """The results of a trainer.
+    """A trainer's results at the points where it was judged.
 
     Attributes:
       train_s: [P] seconds of training up to each point.
       share: [P] share of targets reached at each point.
-      transitions: [P] transitions trained on up to the point.
-      arena_steps: [P] arena steps up to the point.
+      transitions: [P] transitions trained on up to each point.
+      arena_steps: [P] arena steps up to each point.
       compile_s: compile time, s.
     """
 
@@ -115,7 +117,7 @@ Judge = Callable[[LearnerState], float]
 
 
 def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
-    """Makes the judge of both trainers: from learners [N=1, L=1] to the share of targets."""
+    """Makes both trainers' judge; it maps learners [N=1, L=1] to the share of targets reached."""
     study = StudyConfig(levels=race.levels, level_seed=race.level_seed)
     judge = curriculum.load_judge(study, trained, {"goal": trained.stage[-1]})
     return lambda learners: float(judge(learners)["goal"]["targets_reached"][0])
@@ -156,7 +158,7 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
     """Returns the arguments of Brax's `ppo.train`.
 
     Args:
-      race: the race, with the number of points, the settings and the learning rate.
+      race: settings of the race: number of points, kind of Brax's settings, and learning rate.
       trained: our config, with bootstrapped advantages and clipped gradients.
 
     Returns:
@@ -179,7 +181,7 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
 
 
 def _brax_updates(trained: TrainConfig, given: dict[str, Any]) -> int:
-    """Returns the number of Brax's rollouts that fit our budget."""
+    """Returns the number of Brax's rollouts that fit into our budget of control steps."""
     return trained.updates * trained.algo.rollout_length // given["unroll_length"]
 
 
@@ -201,7 +203,7 @@ def _our_settings(trained: TrainConfig) -> dict[str, Any]:
 
 
 def network_factory(trained: TrainConfig) -> Callable[..., Any]:
-    """Makes Brax's networks like ours: layers, activation, Gaussian, and initialisation."""
+    """Makes Brax's networks with our layers, activation, distribution and initialisation."""
     networks = peers.find("brax.training.agents.ppo.networks", "the extra brax")
     algo, orthogonal = trained.algo, jax.nn.initializers.orthogonal
     return partial(
@@ -222,15 +224,15 @@ def network_factory(trained: TrainConfig) -> Callable[..., Any]:
 
 
 def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
-    """Converts Brax's policy to learners [N=1, L=1] of ours, for the judge.
+    """Converts Brax's policy to our learners [N=1, L=1], for the judge.
 
     Args:
-      trained: our config; its networks have the shapes of Brax's.
+      trained: our config; its networks have the same shapes as Brax's networks.
       params: Brax's observation moments, and the parameters of its policy and critic.
 
     Returns:
-      Learners that act like Brax's policy unless an observation exceeds our limit. Their critic is
-      not Brax's.
+      Learners that act like Brax's policy unless an observation exceeds our limit. The critic of
+      these learners is newly initialised instead of Brax's critic.
     """
     moments, policy, _ = params
     mine = ppo.init(jax.random.key(0), trained.algo, moments.mean.shape[-1], 2, 1)
@@ -324,7 +326,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
 
 
 def seconds_to(course: Course) -> dict[str, float | None]:
-    """Returns the seconds of training until each of `SHARES` was first reached, or None."""
+    """Returns the seconds of training until each of `SHARES` is reached; None if it never is."""
     found = {}
     for share in SHARES:
         there = course.train_s[course.share >= share]
@@ -333,7 +335,7 @@ def seconds_to(course: Course) -> dict[str, float | None]:
 
 
 def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
-    """Separates the words of the race from those of training; raises ConfigError."""
+    """Splits the arguments into those of the race and those of training; raises ConfigError."""
     race, rest = key_value.parse(RaceConfig, words)
     trained = load_train(["stage=s6", *rest])
     _check(race, trained)

@@ -1,11 +1,11 @@
 """How much training speed does realism cost, as a whole and for each factor alone?
 
 `python -m benchmarks.realism_cost [arms=real,webots,...] [key=value ...]` takes the keys of
-`swarmjax.train` and compares each program with the ideal one. It calls both alternately, `PAIRS`
-times, after a warm-up pair. For each factor it prints a JSON line with the median ratio of the
-program's time to the ideal program's time, and with an interval that assumes no distribution. With
-10 pairs the interval runs from the second smallest to the second largest ratio and contains the
-true median with a probability of 97.9 %.
+`swarmjax.train`. It compares the training program of each arm with the ideal program, which has no
+realism. It calls both programs alternately, `PAIRS` times, after a warm-up pair. For each arm it
+prints a JSON line with the median ratio of the arm's time to the ideal program's time, and with an
+interval that assumes no distribution. With 10 pairs the interval runs from the second smallest to
+the second largest ratio and contains the true median with a probability of 97.9 %.
 """
 
 import dataclasses
@@ -24,22 +24,23 @@ from swarmjax.sim import dispatch
 from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
 PAIRS = 10
-CALL_SECONDS = 0.5  # approximate time per call of the ideal program
+CALL_SECONDS = 0.5  # s; approximate time of a call of the ideal program
 THREADS = 8  # programs compiled in parallel
 PRESETS = ("real", "webots")
-# `real` has hulls without friction, since friction is another program, not a random number.
+# Fields without an arm. Hull friction is a different program instead of a random number, so the
+# hulls of `real` have none.
 _NO_FACTOR = ("name", "infrared", "stall_time", "hull_friction")
 
 
 def arms() -> dict[str, RealismConfig]:
-    """Returns each arm's realism: the presets, the response alone, and single factors of `real`."""
+    """Returns each arm's realism: a preset, the infrared response alone, or a factor of `real`."""
     presets = {name: load_train([f"realism={name}"]).realism for name in PRESETS}
     real = presets["real"]
     alone = {"infrared": RealismConfig(infrared=real.infrared)}
     for item in dataclasses.fields(RealismConfig):
         if item.name not in _NO_FACTOR:
-            # Factors that change infrared counts need a response with counts, so such a response is
-            # added.
+            # Factors that change infrared counts need an infrared response with counts, so their
+            # arms also have the response.
             base = alone["infrared"] if item.name in COUNTED else RealismConfig()
             alone[item.name] = replace(base, **{item.name: getattr(real, item.name)})
     return presets | alone
@@ -49,7 +50,8 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
     """Times two arms alternately.
 
     Returns:
-      The median ratio of the arm's seconds to the ideal arm's, its interval, and both medians.
+      The median ratio of the arm's time to the ideal arm's time, the interval of this ratio, and
+      the median speeds of both arms.
     """
     pairs = time_in_turn(ideal, arm, updates, PAIRS)
     ratio, low, high = median([mine / theirs for theirs, mine in pairs])
@@ -66,7 +68,7 @@ def compare(ideal: Arm, arm: Arm, updates: int) -> dict[str, Any]:
 
 
 def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator[dict[str, Any]]:
-    """Compiles all arms, then compares each with the ideal one; yields one line per arm."""
+    """Compiles all arms, then compares each with the ideal arm; yields one line per arm."""
     ideal = Arm(replace(settings, realism=RealismConfig()))
     ideal.time(1)
     updates = max(1, round(CALL_SECONDS / ideal.time(1)))
@@ -91,7 +93,7 @@ def results(settings: TrainConfig, chosen: dict[str, RealismConfig]) -> Iterator
 
 
 def _choose(words: Sequence[str]) -> tuple[dict[str, RealismConfig], list[str]]:
-    """Separates `arms=...` from the other words of the command line."""
+    """Separates `arms=...` from the other arguments of the command line."""
     every = arms()
     given = [word.partition("=")[2] for word in words if word.startswith("arms=")]
     names = given[-1].split(",") if given else list(every)

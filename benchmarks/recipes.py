@@ -1,10 +1,11 @@
-"""What does more training achieve? Trains a recipe with several seeds and judges it on the way.
+"""What does more training achieve? Trains a recipe, and judges it at several points of training.
 
 `python -m benchmarks.recipes label=NAME [judged=s6,crowd_dense] [key=value ...]` takes the keys of
-`RecipeConfig` and of `swarmjax.train`. It trains all seeds in one program and stops at points that
-are evenly spaced over the logarithm of the updates. At each point it judges every seed on the
-training device, with drawn and with mean actions, on levels that are in no suite. It prints one
-JSON line.
+`RecipeConfig` and of `swarmjax.train`. A recipe is a set of training settings. The benchmark trains
+all seeds in one program, and pauses at points that are evenly spaced in the logarithm of the number
+of updates. At each point it judges every seed on the training device, once with actions drawn from
+the policy and once with mean actions. The levels for judging are in no suite. It prints one JSON
+line.
 """
 
 import json
@@ -36,9 +37,9 @@ from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 Judge = Callable[[LearnerState], dict[str, dict[str, dict[str, np.ndarray]]]]
-# Metrics of training that are kept, as means over the updates before a point.
+# Training metrics that are reported, as means over the last updates before a point.
 _LOGGED = ("std", "approx_kl", "clip_fraction", "value_loss", "grad_norm", "success_by_stage")
-_KEPT = 20  # maximum number of updates in these means
+_KEPT = 20  # maximum number of updates that these means cover
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,17 +59,17 @@ class RecipeConfig(Section):
 
 
 def parse(words: Sequence[str]) -> tuple[RecipeConfig, TrainConfig]:
-    """Separates the benchmark's own words from those of training.
+    """Separates the benchmark's own arguments from the arguments of training.
 
     Raises:
-      ConfigError: if a word is invalid.
+      ConfigError: if an argument is invalid.
     """
     recipe, rest = key_value.parse(RecipeConfig, words)
     return recipe, load_train(["seeds=5", *rest])
 
 
 def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
-    """Makes the judge of all points.
+    """Makes the judge that is used at every point.
 
     Returns:
       A function that takes learners [N, L] and returns means [N] over levels, by stage, kind of
@@ -110,7 +111,7 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
 
 
 def points(recipe: RecipeConfig, trained: TrainConfig) -> np.ndarray:
-    """Returns the updates after which the recipe is judged, up to the whole budget."""
+    """Returns the updates after which the recipe is judged; the last is the end of the budget."""
     first = min(recipe.first, trained.updates)
     spread = np.geomspace(first, trained.updates, recipe.points)
     return np.unique(np.round(spread).astype(int))
@@ -141,7 +142,7 @@ def measure(recipe: RecipeConfig, trained: TrainConfig) -> Iterator[dict[str, An
 def _train(
     call: Callable[..., Any], state: TrainState, updates: int, rows: int
 ) -> tuple[TrainState, dict[str, Any]]:
-    """Trains all seeds for some updates, in calls of at most the program's report interval."""
+    """Trains all seeds for some updates, in calls of at most `rows` updates each."""
     metrics, last = {}, 0
     for done in range(0, updates, rows):
         last = min(rows, updates - done)
@@ -156,7 +157,7 @@ def _train(
 
 
 def result(recipe: RecipeConfig, trained: TrainConfig, words: Sequence[str]) -> dict[str, Any]:
-    """Trains and judges a recipe; returns its line."""
+    """Trains and judges a recipe; returns its JSON line."""
     found = list(measure(recipe, trained))
     return {
         "benchmark": "recipes",

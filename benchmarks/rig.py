@@ -1,7 +1,7 @@
-"""A test rig for one robot: alone in a square arena of MuJoCo's C engine, with given wheel speeds.
+"""Provides a test rig: one robot in a square arena of MuJoCo's C engine, at given wheel speeds.
 
-It measures numbers of the robot. The rig uses the model that training and the judge share. No code
-here uses the numbers that are expected.
+The rig measures the robot's motion and the forces of walls on it. It uses the model that training
+and the judge share. No code in this file uses the expected results.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 CONTROL_STEP = 0.032  # s; Webots basicTimeStep
 # Physics steps per control step, as in swarmjax.evaluate.
 SUBSTEPS = {"planar": 1, "wheeled": 4}
-SIDE = 2.0  # m; side of the arena, so large that walls are far unless a test needs them
-# What rays can hit; rays ignore contact spheres, wheels, skids and the floor.
+SIDE = 2.0  # m; side of the arena; the walls are far away unless a test needs them
+# Geom groups that rays can hit. Rays ignore contact spheres, wheels, skids and the floor.
 SEEN = np.array([group not in (HULL_GROUP, FLOOR_GROUP) for group in range(6)], np.uint8)
 
 
@@ -31,7 +31,7 @@ class Rig:
     Attributes:
       robot: the robot's settings.
       model: the compiled model.
-      control_step: how long a command holds, s.
+      control_step: time for which a command holds, s.
       substeps: physics steps per control step.
     """
 
@@ -47,13 +47,14 @@ class Rig:
 
 
 class Track(NamedTuple):
-    """The motion of a robot, before the first control step and after each.
+    """The motion of a robot: its state before the first control step and after each control step.
 
     Attributes:
       pose: [T + 1, 3] x (m), y (m), yaw (rad, unwrapped).
-      qpos: [T + 1, Q] positions of MuJoCo.
-      qvel: [T + 1, V] velocities of MuJoCo.
-      force: [T + 1] force of the walls on the robot, N, mean over the control step's physics steps.
+      qpos: [T + 1, Q] MuJoCo's generalised positions.
+      qvel: [T + 1, V] MuJoCo's generalised velocities.
+      force: [T + 1] normal force of the walls on the hull, N, as the mean over the physics steps of
+        a control step.
     """
 
     pose: np.ndarray
@@ -67,8 +68,8 @@ def load(robot: RobotConfig, timestep: float | None = None) -> Rig:
 
     Args:
       robot: settings of the robot.
-      timestep: physics step, s; every physics step then has its own command. None: the judge's
-        steps.
+      timestep: physics step, s; a control step is then a single physics step. None: the judge's
+        control step and number of physics steps.
 
     Returns:
       The rig.
@@ -81,7 +82,7 @@ def load(robot: RobotConfig, timestep: float | None = None) -> Rig:
 
 
 def place(rig: Rig, x: float = 0.0, yaw: float = 0.0) -> mujoco.MjData:
-    """Puts the robot down at rest.
+    """Places the robot in the arena, at rest.
 
     Args:
       rig: the rig.
@@ -89,7 +90,7 @@ def place(rig: Rig, x: float = 0.0, yaw: float = 0.0) -> mujoco.MjData:
       yaw: heading, rad.
 
     Returns:
-      The arena with up-to-date positions.
+      MuJoCo's data of the arena, with up-to-date positions.
     """
     data = mujoco.MjData(rig.model)
     ids = sim_model.ids(rig.model, sim_model.ArenaSize(1, 0, 0.05))
@@ -101,12 +102,12 @@ def place(rig: Rig, x: float = 0.0, yaw: float = 0.0) -> mujoco.MjData:
 
 
 def run(rig: Rig, data: mujoco.MjData, wheels: np.ndarray, steps: int) -> Track:
-    """Turns the wheels.
+    """Turns the wheels at constant speeds, and records the motion.
 
     Args:
       rig: the rig.
-      data: the arena; it is changed.
-      wheels: [2] constant speeds of the left and the right wheel, rad/s.
+      data: MuJoCo's data of the arena, which is changed.
+      wheels: [2] speeds of the left and the right wheel, rad/s.
       steps: number of control steps.
 
     Returns:
@@ -134,7 +135,7 @@ def command(rig: Rig, speed: float, turn_rate: float) -> np.ndarray:
 
 
 def velocity(rig: Rig, track: Track) -> tuple[float, float]:
-    """Returns the mean forward speed (m/s) along the arc and turn rate (rad/s) over a track."""
+    """Returns the mean speed along the arcs of a track (m/s) and its mean turn rate (rad/s)."""
     start, end = track.pose[:-1], track.pose[1:]
     half = 0.5 * (end[:, 2] - start[:, 2])
     middle = start[:, 2] + half
@@ -144,14 +145,14 @@ def velocity(rig: Rig, track: Track) -> tuple[float, float]:
 
 
 def steady(rig: Rig, speed: float, turn_rate: float, steps: int = 50) -> tuple[float, float]:
-    """Returns the steady speed (m/s) and turn rate (rad/s) of a command."""
+    """Returns speed (m/s) and turn rate (rad/s) once a command has held for 10 control steps."""
     data, wheels = place(rig), command(rig, speed, turn_rate)
     run(rig, data, wheels, 10)
     return velocity(rig, run(rig, data, wheels, steps))
 
 
 def _push(rig: Rig, data: mujoco.MjData) -> float:
-    """Sums the normal forces of walls on the hull, N."""
+    """Returns the sum of the normal forces of the walls on the hull, N."""
     hull, total, force = rig.model.geom("robot0_hull").id, 0.0, np.zeros(6)
     for i, pair in enumerate(data.contact.geom):
         if hull in pair:

@@ -1,10 +1,11 @@
-"""What does a larger swarm cost? Times the environment and training with 1 to 50 robots per arena.
+"""How fast are larger swarms? Times simulation and training with 1 to 50 robots per arena.
 
 `python -m benchmarks.robots_speed robots=1,5,50 [total=327680] [key=value ...]` takes the keys of
-`swarmjax.train` except `arenas`, and prints the lines of `benchmarks.steps_per_second` for each
-size, as `robots_speed.*`. The total number of robots is about the same for all sizes: the number of
-arenas is the nearest power of two. Each robot has the same floor area as on s6, in an arena of at
-least 0.8 m with three obstacles. Each program is compiled for exactly its number of robots.
+`swarmjax.train` except `arenas`. For each number of robots per arena it prints the lines of
+`benchmarks.steps_per_second` under the names `robots_speed.*`. The total number of robots is about
+the same for all sizes: the number of arenas is the nearest power of two. Each robot has the same
+floor area as on stage s6, but the side of an arena is at least 0.8 m. Every arena has three
+obstacles. Each program is compiled for exactly its number of robots.
 """
 
 import json
@@ -18,8 +19,8 @@ from swarmjax import command
 from swarmjax.config import Section, about
 from swarmjax.run.settings import TrainConfig, load_train
 
-_ROBOTS, _SIDE = 5, 1.2  # of s6; m
-_LEAST = 0.8  # m; the three obstacles need this side
+_ROBOTS, _SIDE = 5, 1.2  # robots and side (m) of stage s6
+_LEAST = 0.8  # m; the three obstacles need an arena with at least this side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +34,18 @@ class RobotsConfig(Section):
 
 
 def load(robots: int, total: int, words: Sequence[str]) -> TrainConfig:
-    """Makes the config of one size.
+    """Makes the training config for one number of robots.
 
     Args:
       robots: robots per arena.
-      total: approximate total of robots.
-      words: `key=value` words for training.
+      total: approximate number of robots in all arenas together.
+      words: `key=value` arguments for training.
 
     Returns:
       The config.
 
     Raises:
-      ConfigError: if a word is invalid.
+      ConfigError: if an argument is invalid.
     """
     side = max(_LEAST, round(_SIDE * math.sqrt(robots / _ROBOTS), 2))
     arenas = max(8, 2 ** round(math.log2(total / robots)))

@@ -1,15 +1,15 @@
-"""How many sweeps do contacts of hulls with friction need, and how many with other ways to sweep?
+"""How many solver sweeps do hull contacts with friction need, in our solver and in alternatives?
 
 `python -m benchmarks.rub_sweeps [stages=A,...] [designs=A,...] [driver=random] [key=value ...]`
-also takes the keys of `swarmjax.train`. It drives many arenas of each stage, either straight to the
-targets with noise or at random, and keeps their states at every `EVERY`-th control step. It then
-solves the contacts of each state with every design: with `built`, which is
-`sim/fast/rubbing_jax.py`, and with the `DESIGNS` in NumPy. All designs use float32 and get the same
-contacts.
+also takes the keys of `swarmjax.train`. It drives the robots of many arenas of each stage, either
+straight to the targets with noise or at random, and keeps the state at every `EVERY`-th control
+step. It then solves the contacts of each state with every design. The design `built` is the solver
+in `sim/fast/rubbing_jax.py`. The other designs, `DESIGNS`, are written in NumPy. All designs use
+float32 and get the same contacts.
 
-For each stage and design it prints a JSON line with the sweeps, and with the error of the
-accelerations relative to `CONVERGED` plain sweeps in float64. A warp of a GPU needs as many sweeps
-as the slowest of its 32 arenas.
+For each stage and design it prints a JSON line with the number of sweeps and the error of the
+accelerations. The reference accelerations come from at most `CONVERGED` plain sweeps in float64. A
+warp of a GPU needs as many sweeps as the slowest of its 32 arenas.
 """
 
 import json
@@ -36,9 +36,9 @@ from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs
 STAGES = "s6", "fence", "world_fence", "world_door", "crowd", "world_crowd"
 DEFAULTS = ("robot.hull_friction=1", "arenas=512")
 STEPS, EVERY = 480, 24  # control steps per arena, and between two kept states
-CONVERGED, EXACT = 2000, 1e-13  # limit of float64 sweeps, and the change of forces that ends them
-NOISE = 0.5  # standard deviation of the actions of robots that head for their targets
-WARP = 32  # threads of a GPU that wait for each other
+CONVERGED, EXACT = 2000, 1e-13  # limit of float64 sweeps; change of forces that ends them
+NOISE = 0.5  # standard deviation of the noise on actions that head for the target
+WARP = 32  # number of GPU threads that wait for each other
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +56,8 @@ class States(NamedTuple):
     """S states whose contacts are solved; states of the same control step are next to each other.
 
     Attributes:
-      discs: the fixed numbers of the discs.
-      robots: [S] robots of the arenas.
+      discs: the parameters of the discs, which are equal in all states.
+      robots: [S] the robots of each state.
       side: [S] side of the arena, m.
       obstacle: [S, M, 5] x (m), y (m), yaw (rad), half edges (m).
       arenas: number of states per control step.
@@ -75,15 +75,15 @@ class Contacts(NamedTuple):
 
     Attributes:
       x: [K, S] x of the unit vector along which the first robot is pushed.
-      y: [K, S] y of the same vector.
+      y: [K, S] y of the unit vector that `x` belongs to.
       arm: [K, S] lever arm, m.
       give: [K, S] regularisation R, 1 / kg.
-      demand: [K, S, 2] aref of the normal and of the friction force, m/s^2.
+      demand: [K, S, 2] MuJoCo's aref of the normal force and of the friction force, m/s^2.
       stiffness: [K, S, 2] J M^-1 J' + R of both forces, 1 / kg.
       first: [K, S] index of the first robot.
       second: [K, S] index of the second robot; R for a fixture, which does not move.
       there: [K, S] whether the contact exists.
-      kick: [R + 1, S, 3] 1 / mass twice, and 1 / moment of inertia; 0 for index R.
+      kick: [R + 1, S, 3] 1 / mass for x and for y, and 1 / moment of inertia; 0 for index R.
       free: [R + 1, S, 3] acceleration without contacts.
       before: [R + 1, S, 3] acceleration in the previous step.
       friction: [S] coefficient of friction.
@@ -105,13 +105,14 @@ class Contacts(NamedTuple):
 
 
 class Design(NamedTuple):
-    """How to sweep, and what to do between sweeps.
+    """A way to sweep over contacts, and to accelerate convergence between sweeps.
 
     Attributes:
       over: how far a force moves (relaxation), as a share of the distance to its best value.
       since: number of sweeps before relaxation or acceleration starts.
       turns: whether every second sweep goes from the last contact to the first.
-      momentum: whether forces have Nesterov's momentum, which is reset when it leads uphill.
+      momentum: whether forces have Nesterov's momentum, which restarts when it leads uphill in the
+        objective.
       memory: number of past sweeps that Anderson acceleration uses.
     """
 
@@ -146,8 +147,8 @@ class Trail(NamedTuple):
       contacts: contacts of these states.
       motion: [R + 1, S, 3] accelerations.
       force: [K, S, 2] current forces.
-      past: forces after the last sweeps and their changes, the newest first.
-      pace: [S] Nesterov's t.
+      past: forces after the last sweeps and the changes in these sweeps, the newest first.
+      pace: [S] Nesterov's momentum parameter t.
     """
 
     row: np.ndarray
@@ -159,16 +160,16 @@ class Trail(NamedTuple):
 
 
 def record(settings: TrainConfig, driver: str, steps: int = STEPS, every: int = EVERY) -> States:
-    """Drives arenas and keeps states to solve contacts in.
+    """Drives the robots of arenas, and keeps states whose contacts can be solved.
 
     Args:
-      settings: settings of training; hulls have friction, and a control step is one physics step.
+      settings: settings of training, with hull friction and one physics step per control step.
       driver: `target` or `random`.
       steps: number of control steps.
       every: number of control steps between two kept states.
 
     Returns:
-      The states, `steps // every` per arena.
+      The kept states, `steps // every` per arena.
     """
     swarm = environment.load(settings)
     assert swarm.world.physics.substeps == 1
@@ -265,7 +266,7 @@ def contacts_of(states: States) -> Contacts:
 
 
 def _with_nobody(of_robots: np.ndarray) -> np.ndarray:
-    """Rearranges [S, R, 3] to [R + 1, S, 3], with zeros for index R."""
+    """Rearranges an array [S, R, 3] to [R + 1, S, 3], with zeros for index R."""
     return np.pad(of_robots.transpose(1, 0, 2), ((0, 1), (0, 0), (0, 0)))
 
 
@@ -276,17 +277,18 @@ def search(
     dtype: Any = np.float32,
     tolerance: float = TOLERANCE,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sweeps until no force changes.
+    """Sweeps over the contacts of each state until its forces have converged.
 
     Args:
       contacts: contacts of states.
       design: the way to sweep.
       most: maximum number of sweeps.
       dtype: type of all numbers.
-      tolerance: largest allowed change of a force at the end, as a share of the largest push.
+      tolerance: a state has converged if no force changes by more than this share of the state's
+        largest push.
 
     Returns:
-      Accelerations [S, R, 3] of x, y (m/s^2) and yaw (rad/s^2), and sweeps [S].
+      Accelerations [S, R, 3] of x, y (m/s^2) and yaw (rad/s^2), and numbers of sweeps [S].
     """
     whole = Contacts(*(a.astype(dtype) if a.dtype.kind == "f" else a for a in contacts))
     final = _first_force(whole)
@@ -306,7 +308,7 @@ def search(
 
 
 def _keep(trail: Trail, which: np.ndarray) -> Trail:
-    """Keeps the states [S] of a trail that have not converged."""
+    """Keeps the states of a trail that `which` [S] marks as not yet converged."""
     if which.all():
         return trail
     along_second = Contacts(*(a if a.ndim == 1 else a[:, which] for a in trail.contacts))
@@ -321,7 +323,7 @@ def _keep(trail: Trail, which: np.ndarray) -> Trail:
 
 
 def _go_on(trail: Trail, design: Design, done: int) -> tuple[Trail, np.ndarray]:
-    """Takes sweep number `done`; returns the largest distance [S] of a force to its best value."""
+    """Runs sweep number `done`; also returns the largest distance [S] of a force to its optimum."""
     over = design.over if done > design.since else 1.0
     order = range(len(trail.force))
     ordered = order[::-1] if design.turns and done % 2 == 0 else order
@@ -341,7 +343,7 @@ def _go_on(trail: Trail, design: Design, done: int) -> tuple[Trail, np.ndarray]:
 def _sweep(
     trail: Trail, order: Sequence[int], over: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns forces [K, S, 2] and motion after a sweep, and the largest step [S] to a best one."""
+    """Returns forces [K, S, 2], accelerations, and the largest distance [S] to the best force."""
     contacts, motion, force = trail.contacts, trail.motion.copy(), trail.force.copy()
     largest = np.zeros(len(trail.row), force.dtype)
     for k in order:
@@ -358,9 +360,9 @@ def _sweep(
 
 
 def _leap(contacts: Contacts, past: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """Applies Anderson acceleration: the mix of past forces with the smallest mix of changes.
+    """Applies Anderson acceleration: mixes past forces so that their mixed changes are smallest.
 
-    Forces stay unchanged in states where the last change is larger than the one before.
+    Forces stay unchanged in states where the last change is larger than the change before it.
     """
     forces, changes = (np.stack(each) for each in zip(*past, strict=True))
     steps, turns = forces[:-1] - forces[1:], changes[:-1] - changes[1:]
@@ -379,7 +381,7 @@ def _leap(contacts: Contacts, past: list[tuple[np.ndarray, np.ndarray]]) -> np.n
 def _coast(
     trail: Trail, past: list[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Continues the forces' last change (Nesterov's momentum); returns the new pace too."""
+    """Continues the forces' last change (Nesterov's momentum); also returns the new `pace`."""
     (force, change), (before, _) = past
     uphill = np.einsum("ksc,ksc->s", change, force - before) < 0.0
     pace = np.where(uphill, 1.0, trail.pace)
@@ -390,7 +392,7 @@ def _coast(
 
 
 def project(force: np.ndarray, cost: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """Projects forces [..., 2] to |rub| <= friction * push, as `rubbing_jax.project` does."""
+    """Projects forces [..., 2] to the cone |rub| <= friction * push, like `rubbing_jax.project`."""
     push, rub, size = force[..., 0], force[..., 1], np.abs(force[..., 1])
     edge = cost[..., 0] * push + friction * cost[..., 1] * size
     edge = np.maximum(edge / (cost[..., 0] + friction * friction * cost[..., 1]), 0.0)
@@ -400,7 +402,7 @@ def project(force: np.ndarray, cost: np.ndarray, friction: np.ndarray) -> np.nda
 
 
 def _first_force(contacts: Contacts) -> np.ndarray:
-    """Returns the contact forces [K, S, 2] if robots moved as in the previous step."""
+    """Returns the contact forces [K, S, 2] that belong to the previous step's accelerations."""
     found = np.zeros_like(contacts.demand)
     for k in range(len(found)):
         one = _contact(contacts, k)
@@ -418,7 +420,7 @@ def _contact(contacts: Contacts, k: int) -> Contacts:
 
 
 def _moved(contacts: Contacts, motion: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Adds the accelerations caused by forces [K, S, 2]."""
+    """Returns `motion` plus the accelerations that forces [K, S, 2] cause."""
     moved = motion.copy()
     for k in range(len(force)):
         _push(_contact(contacts, k), moved, force[k])
@@ -426,7 +428,7 @@ def _moved(contacts: Contacts, motion: np.ndarray, force: np.ndarray) -> np.ndar
 
 
 def _slide(one: Contacts, motion: np.ndarray) -> np.ndarray:
-    """Computes J a [S, 2] for one contact of each state."""
+    """Computes the relative accelerations J a [S, 2] at one contact of each state."""
     state = np.arange(len(one.friction))
     a, b = motion[one.first, state], motion[one.second, state]
     x, y, turn = a[:, 0] - b[:, 0], a[:, 1] - b[:, 1], a[:, 2] + b[:, 2]
@@ -434,7 +436,7 @@ def _slide(one: Contacts, motion: np.ndarray) -> np.ndarray:
 
 
 def _push(one: Contacts, motion: np.ndarray, force: np.ndarray) -> None:
-    """Adds the accelerations caused by forces [S, 2] of one contact of each state, in place."""
+    """Adds, in place, the accelerations that the forces [S, 2] at one contact per state cause."""
     state, (push, rub) = np.arange(len(one.friction)), force.T
     x, y, turn = one.x * push - one.y * rub, one.y * push + one.x * rub, -one.arm * rub
     pulls = np.stack([x, y, turn], axis=-1)
@@ -444,7 +446,7 @@ def _push(one: Contacts, motion: np.ndarray, force: np.ndarray) -> None:
 
 
 def built(states: States) -> tuple[np.ndarray, np.ndarray]:
-    """Returns accelerations [S, R, 3] and sweeps [S] of the built-in solver."""
+    """Returns accelerations [S, R, 3] and numbers of sweeps [S] of `rubbing_jax.solve`."""
     solve = jax.jit(jax.vmap(partial(rubbing_jax.solve, states.discs)))
     found, sweeps = solve(states.robots, states.side, states.obstacle)
     return np.asarray(found), np.asarray(sweeps)
@@ -456,15 +458,15 @@ def figures(
     """Summarises the results of a design.
 
     Args:
-      sweeps: [S] sweeps.
+      sweeps: [S] numbers of sweeps.
       found: [S, R, 3] accelerations.
       expected: [S, R, 3] converged accelerations.
-      touching: [S] whether there is a contact.
-      arenas: number of states per control step, a multiple of a warp.
+      touching: [S] whether the state has a contact.
+      arenas: number of states per control step, a multiple of `WARP`.
 
     Returns:
-      Sweeps of all states. For states with contacts, also the largest error as a share of the
-      state's largest acceleration.
+      Statistics of the numbers of sweeps of all states, and of the errors of states with contacts.
+      A state's error is its largest deviation as a share of its largest acceleration.
     """
     size = np.abs(expected).max(axis=(1, 2))
     off = (np.abs(found - expected).max(axis=(1, 2)) / size)[touching]
@@ -483,12 +485,12 @@ def figures(
 def results(
     settings: RubSweepsConfig, words: Sequence[str], steps: int = STEPS
 ) -> Iterator[dict[str, Any]]:
-    """Tries every design on the states of every stage; yields one line each.
+    """Tries every design on the states of every stage; yields one line per stage and design.
 
     Args:
       settings: the stages, designs and driver.
-      words: keys of `swarmjax.train`.
-      steps: number of control steps that arenas are driven.
+      words: `key=value` arguments for `swarmjax.train`.
+      steps: number of control steps for which arenas are driven.
 
     Yields:
       Lines for JSON.
@@ -522,7 +524,7 @@ def results(
 
 
 def _check(settings: RubSweepsConfig, words: Sequence[str]) -> None:
-    """Checks that the settings can be measured."""
+    """Checks that the benchmark can run with these settings; raises ConfigError otherwise."""
     known = *DESIGNS, BUILT
     for name in settings.designs:
         if name not in known:

@@ -1,13 +1,13 @@
-"""Runs suites of benchmarks, continues where a run was cut off, and writes docs/benchmarks.md.
+"""Runs suites of benchmarks, resumes runs that were cut off, and writes docs/benchmarks.md.
 
 `python -m benchmarks.run suite=peers out=FILE.jsonl` runs each entry of the suite
-(`benchmarks.suites`) in its own process. It appends the entry's JSON lines to `out` as they come,
-with the entry's name. Results that `out` already has are not run again; failures are. If a process
-dies, or prints nothing for longer than its entry allows, it is recorded as `failed` and the other
-entries continue.
+(`benchmarks.suites`) in its own process. It appends each JSON line to `out` as soon as the process
+prints the line, with the entry's name. Measurements that have a result in `out` are not repeated,
+but failed and skipped measurements are repeated. If a process dies, or prints nothing for longer
+than its entry allows, its current measurement is recorded as `failed` and the suite continues.
 
 `python -m benchmarks.run table=FILE.jsonl docs=docs` only writes the tables and plots of that file
-into docs/benchmarks.md. With `suite` and `docs` this is done at the end.
+into docs/benchmarks.md. With both `suite` and `docs`, the page is written after the suite has run.
 """
 
 import json
@@ -31,7 +31,7 @@ from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 
 Line = dict[str, Any]
-_GRACE = 10.0  # s; a process has this time to end by itself
+_GRACE = 10.0  # s; a process that has not ended by itself after this time is killed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ def command_line(entry: SuiteEntry, values: Sequence[str | None]) -> list[str]:
 
 
 class Output:
-    """The file of JSON lines that a suite adds to."""
+    """The file to which a suite appends its JSON lines."""
 
     def __init__(self, path: Path) -> None:
         """Reads the existing lines.
@@ -135,7 +135,7 @@ class Output:
             ) from None
 
     def add(self, line: Line) -> None:
-        """Writes a line to the file at once."""
+        """Appends a line to the file immediately."""
         self.lines.append(line)
         with self._path.open("a") as file:
             file.write(json.dumps(line) + "\n")
@@ -151,7 +151,7 @@ def read(path: Path) -> list[Line]:
       The lines.
 
     Raises:
-      ConfigError: if there is no such file, or a line is damaged.
+      ConfigError: if the file cannot be read, or a line is not JSON.
     """
     try:
         text = path.read_text()
@@ -170,13 +170,13 @@ def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
     """Runs the remaining values of an entry, in as many processes as needed.
 
     If a process dies or is ended, the value that it was measuring is recorded as failed. The next
-    process takes the values after it.
+    process continues with the value after the failed value.
 
     Args:
       entry: entry of a suite.
-      output: gets the lines.
-      deadline: time by `time.monotonic`. The process that runs at this time is ended, but its value
-        is not recorded as failed.
+      output: the file that the lines are added to.
+      deadline: time of `time.monotonic` at which the run ends. A process that still runs then is
+        ended, but its value is not recorded as failed.
     """
     waiting = left(entry, output.lines)
     while waiting:
@@ -195,7 +195,7 @@ def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
 
 
 def _failed(entry: SuiteEntry, value: str | None, reason: str) -> Line:
-    """Makes the line of a value that has no result."""
+    """Makes the JSON line that records a value as failed."""
     line = {"benchmark": entry.module, "entry": entry.name, "failed": reason}
     return line if entry.over is None else {**line, entry.over: value}
 
@@ -204,12 +204,12 @@ class Process:
     """A benchmark in its own process.
 
     Attributes:
-      reason: why it ended without a result; valid once its lines have been read.
-      late: whether it was ended because the time of the whole run was over.
+      reason: why the process ended without a result; valid once its lines have been read.
+      late: whether the process was ended because the time of the whole run was up.
     """
 
     def __init__(self, entry: SuiteEntry, values: Sequence[str | None]) -> None:
-        """Starts it."""
+        """Starts the process."""
         self.reason, self.late, self._closed = "", False, False
         self._limit = entry.seconds
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115  # `_end` closes it
@@ -233,10 +233,10 @@ class Process:
         self._queue.put(None)
 
     def lines(self, deadline: float) -> Iterator[Line]:
-        """Yields its JSON lines as they come, and ignores all other output.
+        """Yields the JSON lines of the process as it prints them, and ignores all other output.
 
         Args:
-          deadline: time by `time.monotonic` when the process is ended.
+          deadline: time of `time.monotonic` at which the process is ended.
 
         Yields:
           The lines.
@@ -249,7 +249,7 @@ class Process:
             self._end()
 
     def _next(self, deadline: float) -> str | None:
-        """Returns the next line of output; None at its end, or when the time is over."""
+        """Returns the next output line; None at the end, after silence, or at the deadline."""
         left = deadline - time.monotonic()
         try:
             text = self._queue.get(timeout=max(0.0, min(self._limit, left)))
@@ -261,7 +261,7 @@ class Process:
             return None
 
     def _end(self) -> None:
-        """Ends the process and its children, unless it ends by itself."""
+        """Ends the process and its children if needed, and waits until the process has ended."""
         if not self._closed:
             os.killpg(self._process.pid, signal.SIGTERM)
         try:
@@ -274,18 +274,18 @@ class Process:
         self._errors.close()
 
     def _last_words(self) -> str:
-        """Returns its exit code, and the last line of its errors."""
+        """Returns the exit code of the process and the last line of its standard error."""
         self._errors.seek(0)
         words = [line.strip() for line in self._errors if line.strip()]
         return f"exit code {self._process.returncode}: {words[-1][:300] if words else 'silent'}"
 
 
 def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
-    """Runs all entries, and reports each.
+    """Runs all entries of the suite, and reports on each entry.
 
     Args:
       config: which entries to run, and for how long.
-      say: gets one sentence per entry.
+      say: the stream for a report on each entry.
     """
     output = Output(Path(config.out or ""))
     deadline = math.inf if config.minutes is None else time.monotonic() + 60.0 * config.minutes

@@ -18,7 +18,7 @@ _PREFIX = "benchmarks_"
 
 
 def draw(folder: Path, lines: Sequence[Line]) -> list[Path]:
-    """Draws all plots for which there are lines, one file per device.
+    """Draws all plots for which there are lines, with one file per plot and device.
 
     Args:
       folder: folder for the PNG files.
@@ -39,7 +39,7 @@ def draw(folder: Path, lines: Sequence[Line]) -> list[Path]:
         }.items():
             if plot is not None:
                 path = folder / f"{_PREFIX}{name}_{slug}.png"
-                # Without Matplotlib's version, so that the same plot gives the same file.
+                # Matplotlib's version is left out, so that equal plots give equal files.
                 plot.savefig(path, dpi=_DOTS, metadata={"Software": None})
                 written.append(path)
     return written
@@ -53,7 +53,7 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
-    """Draws speed over arenas, one curve per system, with bars from slowest to fastest call."""
+    """Plots speed over number of arenas, a curve per system; bars span slowest to fastest call."""
     curves: dict[str, list[Line]] = {}
     for line in run_tables.choose(lines, benchmark):
         if not line["benchmark"].startswith("robots_speed"):
@@ -84,7 +84,7 @@ def _speeds(lines: Sequence[Line], benchmark: str, key: str) -> Figure | None:
 
 
 def _race(lines: Sequence[Line]) -> Figure | None:
-    """Draws the share of targets over seconds of training."""
+    """Plots the share of targets reached over the seconds of training."""
     mine = [line for line in lines if "curve" in line]
     if not mine:
         return None

@@ -12,12 +12,12 @@ MARKER = "results"
 
 
 def write(folder: Path, lines: Sequence[dict[str, Any]], source: Path) -> None:
-    """Writes the generated part of the page, and the plots next to it.
+    """Writes the generated part of the page, and the plots into a folder next to the page.
 
     Args:
       folder: folder of the page.
       lines: lines of the results.
-      source: file of the results, which the page names.
+      source: file of the results, whose name appears on the page.
 
     Raises:
       ConfigError: if the page is missing, or has no place for the tables.

@@ -18,7 +18,7 @@ def newest(lines: Iterable[Line]) -> list[Line]:
       lines: lines of a file of results, oldest first.
 
     Returns:
-      The newest result of each entry, benchmark and size.
+      The newest result for each combination of entry, benchmark and `_KEYS`.
     """
     found = {}
     for line in lines:
@@ -28,7 +28,7 @@ def newest(lines: Iterable[Line]) -> list[Line]:
 
 
 def missing(lines: Sequence[Line]) -> list[Line]:
-    """Returns the lines of failures and skipped peers without a later result."""
+    """Returns the `failed` and `skipped` lines that no later result replaces."""
     found = {}
     for i, line in enumerate(lines):
         if {"failed", "skipped"} & line.keys():
@@ -39,26 +39,26 @@ def missing(lines: Sequence[Line]) -> list[Line]:
 
 
 def _answers(line: Line, given: dict[str, str], later: Line) -> bool:
-    """Tells whether a later line is a result for a failed one."""
+    """Tells whether a later line has the result that a failed or skipped line lacks."""
     same = later.get("entry") == line.get("entry")
     result = not {"failed", "skipped"} & later.keys()
     return same and result and all(str(later.get(key)) == x for key, x in given.items())
 
 
 def label(line: Line) -> str:
-    """Names the system of a line: a peer by its name, ours by body and implementation."""
+    """Names the measured system: a peer by its name, swarmjax by its body and implementation."""
     if "peer" in line:
         return line["peer"]
     return f"swarmjax, {line['robot']}, {line['impl']}"
 
 
 def choose(lines: Iterable[Line], *benchmarks: str) -> list[Line]:
-    """Selects the lines of some benchmarks; those of peers match by the end of their names."""
+    """Selects the lines of some benchmarks; `.environment` also selects `peer_*.environment`."""
     return [line for line in lines if line["benchmark"].endswith(benchmarks)]
 
 
 def markdown(lines: Sequence[Line]) -> str:
-    """Writes all tables, one part per device.
+    """Writes all tables, with one section per device.
 
     Args:
       lines: lines of a file of results.
@@ -95,7 +95,7 @@ def _rows(heads: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
 
 
 def speed(value: float | None) -> str:
-    """Writes a speed with three digits, in thousands, millions or billions."""
+    """Formats a speed with three digits, in thousands, millions or billions."""
     if value is None:
         return "-"
     for unit, name in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
@@ -105,7 +105,7 @@ def speed(value: float | None) -> str:
 
 
 def seconds(value: float | None, digits: int = 1) -> str:
-    """Writes seconds with some decimal places; `-` for None."""
+    """Formats seconds with `digits` decimal places; None becomes `-`."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
@@ -133,7 +133,7 @@ def _is_robots(line: Line) -> bool:
 
 
 def _counted(lines: Sequence[Line]) -> list[str]:
-    """Makes the table of what a step of each system includes, one row per system."""
+    """Makes the table of what a step includes, with one row per system."""
     mine = {label(line): line for line in choose(lines, ".environment")}
     body = ([name, *(str(line.get(key, "")) for key in _COUNTED)] for name, line in mine.items())
     return [row.replace("--:", "---") for row in _rows(["system", *_COUNTED], body)]
@@ -189,7 +189,10 @@ def _bytes(value: float) -> str:
 
 
 def _trainers(lines: Sequence[Line]) -> list[str]:
-    """Makes a row for each trainer: medians of all seeds, and the seconds of each."""
+    """Makes a row for each trainer and number of arenas.
+
+    Speeds are medians over all seeds. Seconds are given as their median and for each seed.
+    """
     rows: dict[tuple[str, int], list[Line]] = {}
     for line in lines:
         if "trainer" in line:
@@ -225,7 +228,7 @@ def _middle(lines: Sequence[Line], key: str) -> float:
 
 
 def _success(lines: Sequence[Line]) -> list[str]:
-    """Makes a row for each swarm: median and all seeds."""
+    """Makes a row for each swarm, with the median over all seeds and the value of each seed."""
     rows: dict[tuple[str, str], list[Line]] = {}
     for line in choose(lines, "command_to_success"):
         rows.setdefault((line["entry"], label(line)), []).append(line)
@@ -246,7 +249,7 @@ def _success(lines: Sequence[Line]) -> list[str]:
 
 
 def _median(values: Sequence[float | None], digits: int = 1) -> str:
-    """Writes the median and all values; a seed that never succeeded counts as the slowest."""
+    """Formats the median and all values; a seed that never succeeded counts as the slowest."""
     known = sorted(value if value is not None else float("inf") for value in values)
     middle = statistics.median_high(known)
     shown = ", ".join(seconds(value, digits) for value in values)
@@ -270,7 +273,7 @@ def _missing_rows(lines: Sequence[Line]) -> Iterator[str]:
         yield f"- {name}{f' ({what})' if what else ''}: {why}: {line[why]}"
 
 
-# Titles of the tables, and functions that write their rows.
+# Titles of the tables, and the functions that make their rows.
 SECTIONS: dict[str, Callable[[Sequence[Line]], list[str]]] = {
     "Environment: robot steps a second, random actions": _environment,
     "What is counted": _counted,

@@ -1,19 +1,21 @@
-"""How do more arenas and more training change the default recipe?
+"""How do more arenas and more training change the results of the default recipe?
 
 `python -m benchmarks.scaling_law dir=DIR do=train|judge|table [key=value ...]` takes the keys of
 `ScalingConfig`, and those of `swarmjax.train` for `do=train`.
 
-- `train` trains `seeds` policies for every point of `arenas` x `transitions`, in `DIR`. A
-  transition is a control step of one of the five robots of an arena; it determines `budget`. A
-  point with less than one update is skipped, and its line says so.
-- `judge` tries the policies on wheels in MuJoCo C, with drawn and with mean actions. It uses the
-  suite `scaling`: the cells of `headline`, and `crowd_dense`, on which no policy was trained.
-- `table` prints a JSON line for each point, cell and kind of action. The line has the changes from
-  the next smaller number of arenas and from the next smaller number of transitions, taken level by
-  level.
+- `train` trains `seeds` policies for every point, and writes them to `DIR`. A point is a
+  combination of one of `arenas` and one of `transitions`. A transition is a control step of one of
+  the five robots of an arena. The number of transitions determines `budget`. A point with less than
+  one update is skipped, and its line says so.
+- `judge` evaluates the policies on the wheeled robot in MuJoCo C, with drawn and with mean actions.
+  It uses the suite `scaling`, which has the cells of the suite `headline`, and the cell
+  `crowd_dense`, on which no policy was trained.
+- `table` prints a JSON line for each point, cell and kind of action. The line also has the changes
+  from the next smaller number of arenas and from the next smaller number of transitions. These
+  changes are paired by level.
 
-All three continue from the contents of `DIR`. They may be stopped, and judging may run on another
-machine.
+Each of the three commands continues from the contents of `DIR`, so it may be stopped at any time.
+Judging may run on another machine than training.
 """
 
 import json
@@ -64,7 +66,7 @@ class ScalingConfig(Section):
 
 
 class Point(NamedTuple):
-    """A number of arenas and of transitions."""
+    """A point of the study: a number of arenas and a number of transitions."""
 
     arenas: int
     transitions: float
@@ -80,10 +82,10 @@ def points(config: ScalingConfig) -> list[Point]:
 
 
 def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> TrainConfig | None:
-    """Makes the settings of a point's run; None if it has no whole update.
+    """Makes the settings of a point's run; None if the point has less than one update.
 
     Raises:
-      ConfigError: if a word is invalid.
+      ConfigError: if an argument is invalid.
     """
     base = load_train(words)
     if point.transitions < _ROBOTS * point.arenas * base.algo.rollout_length:
@@ -100,7 +102,7 @@ def training(config: ScalingConfig, point: Point, words: Sequence[str]) -> Train
 
 
 def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains the points that have no policies yet; yields one line each."""
+    """Trains the points that have no policies yet; yields a JSON line for each of them."""
     for point in points(config):
         place = Path(config.dir) / str(point)
         settings = training(config, point, words)
@@ -118,13 +120,13 @@ def train(config: ScalingConfig, words: Sequence[str]) -> Iterator[dict[str, Any
 
 
 def _updates(place: Path) -> int:
-    """Reads the number of updates of a finished run; 0 if it has not finished."""
+    """Reads the number of updates of a finished run; 0 if the run has not finished."""
     summary = place / "summary.json"
     return json.loads(summary.read_text())["updates"] if summary.exists() else 0
 
 
 def policies(config: ScalingConfig, point: Point) -> list[str]:
-    """Lists the policies of a point, by seed; none if it was not trained."""
+    """Lists the policy files of a point, by seed; the list is empty before training."""
     return sorted(str(file) for file in (Path(config.dir) / str(point)).glob("policy-seed*.npz"))
 
 
@@ -134,7 +136,7 @@ def judged_file(config: ScalingConfig, point: Point, cell: str, action: str) -> 
 
 
 def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
-    """Judges the points that have not been judged yet, cell by cell; yields short lines."""
+    """Judges the points that have not been judged yet, cell by cell; yields their means."""
     trained = {point: policies(config, point) for point in points(config)}
     some = next((files[0] for files in trained.values() if files), None)
     if some is None:
@@ -151,7 +153,7 @@ def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
 
 
 def _chosen(config: ScalingConfig, settings: EvaluateConfig) -> list[Cell]:
-    """Takes the requested cells and their first levels."""
+    """Returns the requested cells, each with its first `levels` levels."""
     found = {cell.name: cell for cell in cells.load(settings).cells}
     for name in config.cells:
         if name not in found:
@@ -169,7 +171,7 @@ def _chosen(config: ScalingConfig, settings: EvaluateConfig) -> list[Cell]:
 def _try(
     settings: EvaluateConfig, trained: dict[Point, list[str]], cell: Cell
 ) -> dict[Point, dict[str, np.ndarray]]:
-    """Tries the policies of points on a cell; returns [seeds, levels] of each measure."""
+    """Judges the policies of points on a cell; returns each measure's values [seeds, levels]."""
     files = [file for each in trained.values() for file in each]
     if not files:
         return {}
@@ -217,7 +219,7 @@ def _line(config: ScalingConfig, point: Point, cell: str, action: str) -> dict[s
 
 
 def _smaller(config: ScalingConfig, point: Point) -> dict[str, Point]:
-    """Returns the points with the next smaller number of arenas and of transitions."""
+    """Returns the points with the next smaller `arenas` and `transitions`, if they exist."""
     arenas = [each for each in config.arenas if each < point.arenas]
     transitions = [each for each in config.transitions if each < point.transitions]
     found = {}

@@ -1,9 +1,10 @@
 """How much faster do several seeds train in one program than one seed alone?
 
-`python -m benchmarks.seeds_speed [key=value ...]` takes the keys of `swarmjax.train` (`seeds` is 10
-by default; `arenas` is the number per seed) and trains all seeds and one seed alternately. It
-prints a JSON line with the transitions per second of both, and with their ratio. All are medians
-over `PAIRS` pairs, and the ratio has a 95 % interval by order statistics.
+`python -m benchmarks.seeds_speed [key=value ...]` takes the keys of `swarmjax.train`. `seeds` is 10
+by default, and `arenas` is the number per seed. It alternates between a call that trains all seeds
+and a call that trains one seed. It prints a JSON line with the transitions per second of both
+programs, and with their ratio. These numbers are medians over `PAIRS` pairs of calls. The ratio
+also has a 95 % interval from order statistics.
 """
 
 import json
@@ -19,17 +20,17 @@ from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.sim import dispatch
 
 PAIRS = 10
-CALL_SECONDS = 0.5  # approximate time per call of one seed
+CALL_SECONDS = 0.5  # s; approximate time of a call that trains one seed
 
 
 def _speed(arm: Arm, updates: int) -> float:
-    """Returns the transitions per second of one call."""
+    """Runs one call, and returns its transitions per second."""
     seconds = arm.time(updates)
     return arm.transitions / seconds
 
 
 def result(settings: TrainConfig) -> dict[str, Any]:
-    """Compiles both programs and times them alternately; returns the line."""
+    """Compiles both programs and times them alternately; returns the JSON line."""
     with ThreadPoolExecutor(2) as pool:
         one, all_ = pool.map(Arm, [replace(settings, seeds=1), settings])
     for arm in (one, all_):

@@ -1,14 +1,14 @@
-"""Do memory, descriptors and speed of a long run stay constant?
+"""Do memory use, open file descriptors and speed stay constant in a long training run?
 
 `python -m benchmarks.soak dir=DIR minutes=60 [key=value ...]` trains in `DIR`/run for this time and
 then asks the run to stop. It appends a sample every ten seconds to `DIR`/samples.jsonl. All other
-keys are keys of `swarmjax.train`. The same command given again resumes the run. What the run does
-after one command is called a leg. `python -m benchmarks.soak dir=DIR do=table` prints a JSON line
-with the median and the slope of each quantity of each leg. The slope is in percent of the median
-per hour, by Theil and Sen, with a 95 % interval.
+keys are keys of `swarmjax.train`. Repeating the command resumes the run. A leg is the part of the
+run that one command trains. `python -m benchmarks.soak dir=DIR do=table` prints a JSON line with
+the median and the slope of each quantity in each leg. The slope is a Theil-Sen estimate in percent
+of the median per hour, with a 95 % interval.
 
-Speed is given per second, and per second of processor time, which other processes on the machine
-affect less.
+Speed is given per second of elapsed time and per second of processor time. Other processes on the
+machine affect the speed per second of processor time less.
 """
 
 import json
@@ -31,10 +31,10 @@ from swarmjax.config import Section, about
 from swarmjax.exit_codes import REQUEUE
 from swarmjax.run import directory
 
-EVERY_S = 10.0  # between two samples
-WARM_UP = 0.1  # first share of a leg, left out since caches fill and the policy learns to move
+EVERY_S = 10.0  # s between two samples
+WARM_UP = 0.1  # share of a leg left out at its start: caches fill, the policy learns to move
 SAMPLES = "samples.jsonl"
-_TAIL = 65_536  # bytes at the end of the metrics, which contain the last line
+_TAIL = 65_536  # bytes read from the end of the metrics, enough for the last line
 _LEVELS = ("memory_mb", "device_memory_mb", "descriptors", "threads")
 _SPEEDS = ("arena_steps_per_s", "arena_steps_per_cpu_s")
 
@@ -49,15 +49,15 @@ class SoakConfig(Section):
 
 
 def sample(pid: int, run: Path) -> dict[str, float]:
-    """Samples a process and the progress of its run.
+    """Measures a process and the progress of its training run.
 
     Args:
       pid: Id of the process.
       run: The run directory.
 
     Returns:
-      Resident memory, memory of the GPU if there is one, open descriptors, threads, processor
-      seconds since the start, and arena control steps of the run.
+      Resident memory, used GPU memory if there is a GPU, number of open file descriptors, number of
+      threads, processor seconds since the start, and arena steps of the run.
 
     Raises:
       OSError: If the process has ended.
@@ -84,7 +84,7 @@ def _device_memory() -> float | None:
 
 
 def _arena_steps(metrics: Path) -> int:
-    """Reads the steps of a run from the last complete line of its metrics; 0 without a line."""
+    """Reads a run's arena steps from the last complete line of its metrics; 0 without a line."""
     if not metrics.exists():
         return 0
     with metrics.open("rb") as file:
@@ -95,11 +95,11 @@ def _arena_steps(metrics: Path) -> int:
 
 
 def leg(settings: SoakConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Trains for a while, writes samples to the file and yields them.
+    """Trains for `settings.minutes`, appends samples to the file `SAMPLES` and yields them.
 
     Args:
       settings: Settings of the soak.
-      words: Words for `swarmjax.train`.
+      words: `key=value` arguments for `swarmjax.train`.
     """
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -124,13 +124,13 @@ def leg(settings: SoakConfig, words: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
-    """Reads the samples of a soak; none before its first leg."""
+    """Reads the samples of all legs; returns an empty list before the first leg."""
     path = folder / SAMPLES
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def sum_up(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Finds the median and the slope of each quantity of one leg.
+    """Computes the median and the slope of each quantity in one leg.
 
     Args:
       rows: Samples of the leg, in order.
@@ -167,7 +167,7 @@ def _trend(hours: np.ndarray, values: np.ndarray) -> dict[str, float]:
 
 
 def table(folder: Path) -> dict[str, Any]:
-    """Summarises all legs; returns the line."""
+    """Summarises all legs in one JSON line."""
     rows = read(folder)
     legs = {
         str(number): {

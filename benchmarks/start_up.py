@@ -1,10 +1,10 @@
 """How many seconds pass from the command to the first update, with cold and with warm caches?
 
-`python -m benchmarks.start_up [warm=5] [key=value ...]` takes the keys of `swarmjax.train` and runs
-this command in separate processes: once with empty caches of XLA and Warp, then `warm` times with
-the caches that the first run filled. It prints a JSON line for cold and for warm caches, with the
-median over the runs. The clock starts before Python starts and stops when the metrics of the first
-update are on the disk.
+`python -m benchmarks.start_up [warm=5] [key=value ...]` takes the keys of `swarmjax.train`. It runs
+`swarmjax.train` in separate processes: once with empty caches of XLA and Warp, then `warm` times
+with the caches that the first run filled. It prints a JSON line for cold caches and another line
+for warm caches, each with the median over its runs. The clock starts before Python starts and stops
+when the metrics of the first update are on the disk.
 """
 
 import statistics
@@ -32,7 +32,7 @@ class StartConfig(Section):
 
 
 def caches(folder: Path) -> dict[str, str]:
-    """Returns environment variables that put all caches into a folder, even of small programs."""
+    """Returns environment variables that cache all programs, even small ones, in a folder."""
     return {
         "JAX_COMPILATION_CACHE_DIR": str(folder / "xla"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -42,15 +42,15 @@ def caches(folder: Path) -> dict[str, str]:
 
 
 def measure(words: Sequence[str], run: Path, environment: dict[str, str]) -> tuple[float, Row]:
-    """Starts a run.
+    """Runs training up to the first update.
 
     Args:
-      words: words for training.
+      words: `key=value` arguments for training.
       run: directory of the run.
       environment: environment variables of the run.
 
     Returns:
-      Seconds to the first update, and the run's summary.
+      Seconds from the command to the first update, and the run's summary.
     """
     watched = Watched([*words, *_FIRST], run, environment)
     first = [seconds for seconds, _ in watched.rows()]
@@ -58,7 +58,7 @@ def measure(words: Sequence[str], run: Path, environment: dict[str, str]) -> tup
 
 
 def results(given: StartConfig, words: Sequence[str]) -> Iterator[Row]:
-    """Measures cold and warm starts; yields one line each."""
+    """Measures starts with cold caches and with warm caches; yields a JSON line for each."""
     trained = load_train(words)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

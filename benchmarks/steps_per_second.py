@@ -3,14 +3,15 @@
 `python -m benchmarks.steps_per_second [key=value ...]` takes the keys of `swarmjax.train`. Several
 numbers of arenas are separated by commas, as in `arenas=1024,65536`. For every number of arenas it
 prints a JSON line for physics alone, for the environment including physics, and for training
-including both. Each number is the median of `timing.REPEATS` timed calls after a warm-up call.
+including both. Each speed is the median of `timing.REPEATS` timed calls after a warm-up call.
 Compile time is listed separately.
 
-In physics and environment all robots of the last stage take random actions. In training they take
-the policy's actions. Before the timing of environment and physics, the environment steps for a
-whole episode, with clocks spread over the step limit. Arenas then have all ages, and some reset in
-every timed call; `episodes_ended` counts these in the last call. Speeds are totals over all
-`seeds`. If a device runs out of memory, the line says so as `failed`.
+For physics and environment, all robots of the last stage take random actions. For training, robots
+take the policy's actions. Before environment and physics are timed, the environment runs for a
+whole episode, in which the arenas' clocks start spread over the step limit. Arenas are then at all
+points of an episode, and some of them reset in every timed call. `episodes_ended` counts the resets
+in the last call. Speeds are totals over all `seeds`. If a device runs out of memory, the line gives
+the reason as `failed`.
 """
 
 import json
@@ -40,11 +41,11 @@ from swarmjax.training import rollout, seeds
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
-# Control steps per call of physics and environment; whole rollouts of the default algorithm.
+# Control steps per call of physics and environment: whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}
-TRAIN_SECONDS = 1.0  # approximate time per call of training
+TRAIN_SECONDS = 1.0  # s; approximate time of a call of training
 THREADS = 4  # sizes compiled in parallel
-# Every line has these entries, as the lines of peers do.
+# Every line has these entries. The lines of peers have entries with the same names.
 COUNTED = {
     "step": "control step: command, rigid bodies with contacts, 8 infrared rays, reward",
     "resets": "at once, each on a fresh random level that was drawn ahead of the rollout",
@@ -54,16 +55,16 @@ COUNTED = {
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """One size, compiled but not run.
+    """The programs of one size, compiled but not yet run.
 
     Attributes:
-      program: the compiled program.
-      schedule: numbers of the curriculum.
-      start: makes the first state of a schedule.
+      program: the parts of training that are fixed at compile time.
+      schedule: the curriculum's numbers, an argument of the compiled programs.
+      start: makes the first state from the schedule.
       keys: [N] a random key for each seed.
-      physics: steps the physics alone.
-      environment: steps the environment.
-      training: trains.
+      physics: program that steps the physics alone.
+      environment: program that steps the environment.
+      training: program that trains.
     """
 
     program: Program
@@ -95,7 +96,7 @@ def prepare(settings: TrainConfig) -> Prepared:
 
 
 def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvState, Array]:
-    """Moves all arenas with random commands.
+    """Steps the physics of all arenas with random commands.
 
     Returns:
       The unchanged arenas, so that each timed call does the same work, and a number that depends on
@@ -167,7 +168,7 @@ def _line(
     calls_s: list[float],
     transitions: float | None = None,
 ) -> dict[str, Any]:
-    """Makes a result line with the names in docs/interface.md."""
+    """Makes a result line whose entries have the names in docs/interface.md."""
     settings, compiled = prepared.program.config, getattr(prepared, name)
     seconds = statistics.median(calls_s)
     arena_steps = control_steps * settings.seeds * settings.arenas / seconds
@@ -187,11 +188,11 @@ def _line(
 
 
 def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
-    """Returns the entries of a line about the simulation and the way of counting.
+    """Returns the entries of a result line that describe the simulation and what a step counts.
 
     Args:
       settings: settings of training.
-      impl: implementation that was used; with None the function finds out, which may need the GPU.
+      impl: implementation that was used; None: found from the settings, which may use the GPU.
 
     Returns:
       Entries with the names in docs/interface.md.
@@ -214,7 +215,7 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
 
 
 def made_with() -> dict[str, Any]:
-    """Returns the entries of a line about device, versions and commit."""
+    """Returns the entries of a result line that give the device, versions and commit."""
     return {
         "device": provenance.device(),
         "versions": provenance.versions(),
@@ -223,10 +224,10 @@ def made_with() -> dict[str, Any]:
 
 
 def settle(prepared: Prepared) -> rollout.Arena:
-    """Steps the environment until its arenas have all ages.
+    """Steps the environment until its arenas are at all points of an episode.
 
     Returns:
-      The arenas after one step limit, started with clocks spread evenly over it.
+      The arenas after at least one step limit. Their clocks started evenly spread over this limit.
     """
     settings = prepared.program.config
     arenas: rollout.Arena = prepared.start(prepared.schedule).arenas
@@ -240,14 +241,14 @@ def settle(prepared: Prepared) -> rollout.Arena:
 
 
 def time_physics(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
-    """Times the physics alone; returns the line. The arenas' buffers are donated."""
+    """Times the physics alone; returns the JSON line. The arenas' buffers are donated."""
     calls_s, _ = timing.time_program(prepared.physics, arenas, prepared.keys)
     steps = CONTROL_STEPS[prepared.program.config.robot.body]
     return _line(prepared, "physics", steps, calls_s)
 
 
 def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any]:
-    """Times the environment; returns the line. The arenas' buffers are donated."""
+    """Times the environment; returns the JSON line. The arenas' buffers are donated."""
     settings = prepared.program.config
     argument = prepared.schedule, prepared.keys
     calls_s, sums = timing.time_program(prepared.environment, arenas, argument)
@@ -257,10 +258,10 @@ def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any
 
 
 def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
-    """Times training, in calls whose length is based on the environment's speed.
+    """Times training; the environment's speed determines the number of updates per call.
 
     Args:
-      prepared: the compiled size.
+      prepared: the compiled programs of one size.
       arena_steps_per_s: speed of the environment; training is assumed to be half as fast.
 
     Returns:
@@ -285,16 +286,16 @@ def results(prepared: Prepared) -> list[dict[str, Any]]:
 
 
 def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
-    """Compiles all sizes, then runs one after the other; yields the lines of each.
+    """Compiles all sizes, then times one size after the other; yields the lines of each size.
 
-    Compiling takes much longer than running, so it is done in threads. It is complete before the
-    first call is timed.
+    Compiling takes much longer than running, so threads compile several sizes in parallel. All
+    compiling is complete before the first call is timed.
     """
     with ThreadPoolExecutor(THREADS) as pool:
         futures = [pool.submit(prepare, settings) for settings in points]
     for settings in points:
         try:
-            # Removed from the list, so that each size frees its device memory.
+            # `pop` removes the size from the list, so that its device memory is freed.
             yield results(futures.pop(0).result())
         except jax.errors.JaxRuntimeError as error:
             reason = str(error).partition("\n")[0][:300]
@@ -317,14 +318,14 @@ def _environments(
 
 
 def split(words: Sequence[str], key: str) -> tuple[list[str], list[str]]:
-    """Separates a key with several values from the other words of a command line.
+    """Separates a key with several values from the other arguments of a command line.
 
     Args:
-      words: `key=value` words.
+      words: `key=value` arguments.
       key: the key; commas separate its values.
 
     Returns:
-      The key's values, none if the key is missing, and the other words.
+      The list of the key's values, which is empty if the key is missing, and the other arguments.
     """
     given = [word.partition("=")[2] for word in words if word.startswith(f"{key}=")]
     rest = [word for word in words if not word.startswith(f"{key}=")]

@@ -1,14 +1,14 @@
 """Defines the suites of `benchmarks.run`: benchmarks and their sizes, the most important first.
 
-An entry answers one question: it runs one file of benchmarks/ in its own process.
+Each entry of a suite answers one question, by running one file of benchmarks/ in its own process.
 """
 
 from dataclasses import dataclass, field, replace
 
 CPU = {"JAX_PLATFORMS": "cpu"}
-# Peers and our entries next to them use full precision, so that tensor cores make no difference.
+# Peers multiply matrices in full precision, so that tensor cores make no difference to them.
 HIGHEST = {"JAX_DEFAULT_MATMUL_PRECISION": "highest"}
-# Without preallocation, the GPU's free memory also shows the allocations of Warp and others.
+# Without preallocation, the drop in the GPU's free memory shows what XLA and Warp really allocate.
 AS_NEEDED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 ARENAS = ("65536", "16384", "262144", "4096", "1024", "256")
 SEEDS = ("0", "1", "2", "3", "4")
@@ -19,13 +19,13 @@ class SuiteEntry:
     """One benchmark with its settings.
 
     Attributes:
-      name: name of the entry, also in its lines.
+      name: name of the entry, which its lines also have.
       module: module in benchmarks/.
-      words: `key=value` words.
-      over: key with several values.
+      words: `key=value` arguments.
+      over: key whose several values are measured one by one.
       values: the values of `over`; each line has one of them.
-      each: number of values per process; None for all.
-      seconds: time limit per value; the process is ended after it.
+      each: number of values per process; None: all values in one process.
+      seconds: time limit, s; a process that prints nothing for this long is ended.
       environment: environment variables of the process.
     """
 
@@ -47,12 +47,12 @@ def _speed(name: str, *words: str, values: tuple[str, ...] = ARENAS) -> SuiteEnt
         words=("budget=1e10", *words),
         over="arenas",
         values=values,
-        seconds=480.0,  # the first value waits until all are compiled
+        seconds=480.0,  # the first line comes after all values are compiled
     )
 
 
 def _robots(name: str, *words: str) -> SuiteEntry:
-    """Makes the same entry for swarms of several sizes."""
+    """Makes an entry for physics, environment and training at several numbers of robots."""
     values = ("5", "1", "50", "10", "20", "2", "3")
     return SuiteEntry(
         name=name, module="robots_speed", words=words, over="robots", values=values, seconds=480.0
@@ -60,7 +60,7 @@ def _robots(name: str, *words: str) -> SuiteEntry:
 
 
 def _memory(name: str, *words: str) -> SuiteEntry:
-    """Makes an entry for memory at two sizes, one process each, since a peak covers a process."""
+    """Makes a memory entry; each size has its own process, since a peak covers a whole process."""
     return SuiteEntry(
         name=name,
         module="memory",
@@ -73,7 +73,7 @@ def _memory(name: str, *words: str) -> SuiteEntry:
 
 
 def _peer(name: str, values: tuple[str, ...], *words: str) -> SuiteEntry:
-    """Makes an entry for the environment of a peer."""
+    """Makes an entry for the speed of a peer's environment."""
     return SuiteEntry(
         name=name, module=name, words=words, over="arenas", values=values, environment=HIGHEST
     )

@@ -1,10 +1,11 @@
-"""How many seconds of training does a swarm need to reach its targets, and how fast was training?
+"""How many seconds of training does a swarm need to reach its targets, and how fast is training?
 
 `python -m benchmarks.time_to_success RUN [SHARE]` reads a run directory of `swarmjax.train` and
-prints a JSON line for each seed. It gives the seconds, without compilation, until robots on the
-last stage first reached at least SHARE (0.9) of the targets over a whole cohort of training
-episodes. Seconds are measured only at the end of each call (`run.chunk`), so they are rounded up to
-the end of a call. The seeds of a run share these times, and the speeds are totals over all seeds.
+prints a JSON line for each seed. The line has the training seconds, without compilation, until
+robots on the last stage first reached at least SHARE of their targets. SHARE is 0.9 by default, and
+the share is taken over a whole cohort of training episodes. Seconds are measured only at the end of
+each call (`run.chunk`), so they are rounded up to the end of a call. The seeds of a run train
+together, so they share one clock, and the speeds are totals over all seeds.
 """
 
 import json
@@ -41,7 +42,7 @@ def lines(run: Path, share: float) -> list[Row]:
       share: share of targets that counts as success, 0..1.
 
     Returns:
-      A JSON line for each seed; seconds and steps are None if the share was never measured.
+      A JSON line for each seed; its seconds and steps are None if the share was never reached.
 
     Raises:
       ConfigError: if a file is missing or damaged.
@@ -92,7 +93,7 @@ def _read_summary(run: Path) -> Row:
 
 
 def _read_rows(run: Path, stages: int) -> list[Row]:
-    """Reads the metrics of a run, and checks the values that the lines need."""
+    """Reads the metrics of a run, and checks the values that the JSON lines need."""
     found = []
     for where, row in report_rows.read_lines(run, METRICS):
         report_rows.check(row, ("seed", "arena_steps", "broken_arenas"), report_rows.WHOLE, where)
@@ -104,7 +105,7 @@ def _read_rows(run: Path, stages: int) -> list[Row]:
 
 
 def _share(text: str) -> float:
-    """Reads a share of the targets."""
+    """Parses a share of the targets; raises ConfigError unless it is from 0 to 1."""
     try:
         share = float(text)
     except ValueError:

@@ -43,7 +43,7 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
     compiled = lowered.compile(loop.compiler_options())
     seconds = time.perf_counter() - began
     memory = compiled.memory_analysis()
-    assert memory is not None  # known on both CPU and GPU
+    assert memory is not None  # available on both CPU and GPU
     size = memory.argument_size_in_bytes + memory.temp_size_in_bytes
     size += memory.output_size_in_bytes - memory.alias_size_in_bytes
     return TimedProgram(compiled, seconds, size)
@@ -52,7 +52,7 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
 def time_program(
     program: TimedProgram, state: Any, argument: Any, repeats: int = REPEATS
 ) -> tuple[list[float], Any]:
-    """Times calls after a warm-up call; each call continues with the state of the one before.
+    """Times calls after a warm-up call; each call continues with the state of the previous call.
 
     Args:
       program: the program to call.
@@ -61,7 +61,7 @@ def time_program(
       repeats: number of timed calls.
 
     Returns:
-      Seconds of each call, and the rest that the last one returned.
+      Seconds of each timed call, and the rest that the last call returned.
     """
     taken, rest = [], None
     for _ in range(1 + repeats):
@@ -73,14 +73,14 @@ def time_program(
 
 
 def time_calls(call: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
-    """Times a call that waits for its own end, after a warm-up call.
+    """Times calls of a function that waits for its results, after a warm-up call.
 
     Args:
-      call: the call.
+      call: the function to call.
       repeats: number of timed calls.
 
     Returns:
-      Seconds of each call.
+      Seconds of each timed call.
     """
     taken = []
     for _ in range(1 + repeats):
@@ -91,7 +91,7 @@ def time_calls(call: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
 
 
 def spread(calls_s: list[float]) -> dict[str, Any]:
-    """Returns the entries of a line about the times of calls: all times, and their median."""
+    """Returns the entries of a result line for the times of calls: all times and their median."""
     return {"calls_s": calls_s, "call_s": statistics.median(calls_s)}
 
 

@@ -1,15 +1,15 @@
-"""What does a policy lose on the wheeled body, and with a realism that it was not trained with?
+"""How much worse is a policy on the wheeled body, and with a realism not used in its training?
 
 `python -m benchmarks.transfer policies=ideal:a.npz+b.npz,real:c.npz [key=value ...]` takes the keys
-of `swarmjax.evaluate` except `policy` and `suite`. Each `label:` has the files of one or several
-seeds, joined by `+`. Every policy is judged in MuJoCo C on the same levels in each world of
-`WORLDS`.
+of `swarmjax.evaluate` except `policy` and `suite`. After each `label:` come the policy files of one
+or several seeds, joined by `+`. Every policy is judged in MuJoCo C on the same levels in each world
+of `WORLDS`.
 
-For each label and world it prints a JSON line with means and their 95 % intervals, and with paired
-differences to the label's first world (`_change`) and to the same body's ideal world
-(`_realism_change`). Intervals are from a bootstrap that draws whole levels, the same for all seeds.
-They therefore hold for these policies on other levels. `targets_reached_by_seed` shows how much
-seeds differ.
+For each label and world it prints a JSON line with means and their 95 % intervals. The line also
+has paired differences from the label's first world (`_change`) and from the ideal world with the
+same body (`_realism_change`). The intervals come from a bootstrap that draws whole levels, and the
+same levels for all seeds. The intervals therefore hold for these policies on other levels.
+`targets_reached_by_seed` shows how much seeds differ.
 """
 
 import json
@@ -33,7 +33,7 @@ def judge(settings: EvaluateConfig, files: Sequence[str]) -> dict[str, np.ndarra
     """Judges the policies of one label.
 
     Args:
-      settings: settings of the evaluation; its policy is not used.
+      settings: settings of the evaluation; their policy is not used.
       files: policy files, one per seed.
 
     Returns:
@@ -51,10 +51,10 @@ def summarize(
     Args:
       found: [seeds, levels] values of each measure in a world.
       first: values in the label's first world.
-      ideal: values of the same body without realism.
+      ideal: values in the world with the same body and without realism.
 
     Returns:
-      The numbers of a line.
+      The numeric entries of the JSON line.
     """
     result: dict[str, Any] = {"targets_reached_by_seed": found["targets_reached"].mean(1).tolist()}
     for name in MEASURES:
@@ -70,7 +70,7 @@ def summarize(
 
 
 def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[dict[str, Any]]:
-    """Judges all labels in all worlds; yields one line each."""
+    """Judges all labels in all worlds; yields one JSON line per label and world."""
     some = next(iter(policies.values()))[0]
     for label, files in policies.items():
         worlds: dict[tuple[str, str], dict[str, np.ndarray]] = {}
@@ -101,7 +101,7 @@ def results(words: Sequence[str], policies: dict[str, list[str]]) -> Iterator[di
 
 
 def _policies(words: Sequence[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """Separates `policies=...` from the other words of the command line."""
+    """Separates `policies=...` from the other arguments of the command line."""
     given = [word.partition("=")[2] for word in words if word.startswith("policies=")]
     labelled = [part.partition(":") for part in given[-1].split(",")] if given else []
     if not labelled or not all(label and files for label, _, files in labelled):

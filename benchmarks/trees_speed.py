@@ -1,11 +1,12 @@
-"""How fast does this tree train compared with another checkout, or with other settings?
+"""How fast does this checkout train compared with another checkout, or with other settings?
 
 `python -m benchmarks.trees_speed [before=FOLDER] [than=key=value] [stage=NAME] [key=value ...]`
-takes the keys of `swarmjax.train`, for both sides. `before` is a checkout of another commit, this
-one by default. `than` is a setting only for this tree's side. Each side is a separate process, and
-the two run alternately: one call each, `PAIRS` times, after a warm-up pair. It prints a JSON line
-with the median ratio of this tree's speed to the other's, and with an interval that assumes no
-distribution.
+takes the keys of `swarmjax.train`, which apply to both sides of the comparison. The first side
+trains with the code in the folder `before`, by default this checkout. The second side trains with
+the code of this checkout, and with the setting `than` if that is given. Each side is a separate
+process. The two processes run alternately, one call each, `PAIRS` times, after warm-up calls. It
+prints a JSON line with the median ratio of the second side's speed to the first side's speed, and
+with an interval that assumes no distribution.
 """
 
 import json
@@ -25,8 +26,8 @@ from swarmjax.config import ConfigError, Section, about
 from swarmjax.run.settings import TrainConfig, load_train
 
 PAIRS = 15
-CALL_SECONDS = 0.7  # approximate time per call of either side
-# Program of both processes; each runs it in the checkout that is its working directory.
+CALL_SECONDS = 0.7  # s; approximate time of a call of either side
+# Program of both processes; each process runs it with its checkout as working directory.
 _SIDE = """
 import sys
 from benchmarks.pairs import Arm
@@ -40,14 +41,14 @@ for line in sys.stdin:
 
 @dataclass(frozen=True, kw_only=True)
 class TreesSpeedConfig(Section):
-    """What is compared."""
+    """Settings: what to compare."""
 
     before: str = field(default=".", metadata=about("checkout to compare with this one"))
     than: str | None = field(default=None, metadata=about("setting only for this tree's side"))
 
 
 class Side:
-    """A process that trains in a checkout on request.
+    """A process that trains with the code of a checkout, on request.
 
     Attributes:
       compile_s: seconds of compiling.
@@ -89,14 +90,14 @@ def compare(settings: TreesSpeedConfig, words: Sequence[str]) -> dict[str, Any]:
     """Times both sides alternately.
 
     Args:
-      settings: the two sides.
-      words: words for both sides.
+      settings: settings of the two sides.
+      words: `key=value` training arguments for both sides.
 
     Returns:
-      A line for JSON.
+      The JSON line.
 
     Raises:
-      ConfigError: if a side cannot be trained.
+      ConfigError: if one side cannot train.
     """
     load_train([*words, *filter(None, [settings.than])])
     before = Side(Path(settings.before).resolve(), words)
@@ -126,7 +127,7 @@ def compare(settings: TreesSpeedConfig, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _commit(tree: Path) -> str | None:
-    """Reads the commit of a checkout; for a copy without git, from its file `commit`."""
+    """Reads a checkout's commit from its file `commit` if there is one, else from git."""
     if (tree / "commit").is_file():
         return (tree / "commit").read_text().strip()
     words = ["git", "-C", str(tree), "rev-parse", "--short=12", "HEAD"]

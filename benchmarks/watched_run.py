@@ -16,15 +16,16 @@ from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.report import rows as report_rows
 from swarmjax.run.recorder import METRICS
 
-# Entries of a run's summary about device, versions and commit.
+# Entries of a run's summary that give the device, versions and commit.
 MADE_WITH = ("device", "versions", "commit")
 _PAUSE = 0.01  # s between two reads of the run's metrics
-# Many containers keep Python from saving its bytecode, which makes every start seconds longer.
+# Many containers prevent Python from saving its bytecode, so every start takes seconds longer. An
+# empty value lets Python save bytecode.
 _AS_EVERYWHERE = {"PYTHONDONTWRITEBYTECODE": ""}
 
 
 class Watched:
-    """A training run.
+    """A training run in its own process.
 
     Attributes:
       directory: directory of the run.
@@ -37,7 +38,7 @@ class Watched:
         """Starts the run.
 
         Args:
-          words: `key=value` words for `swarmjax.train`.
+          words: `key=value` arguments for `swarmjax.train`.
           directory: directory for the run; it must not exist.
           environment: environment variables in addition to those of this process.
         """
@@ -52,10 +53,10 @@ class Watched:
         )
 
     def rows(self) -> Iterator[tuple[float, dict[str, Any]]]:
-        """Yields the rows of the run's metrics until it ends, with the seconds since the command.
+        """Yields each row of the metrics and the seconds since the run started, until the run ends.
 
         Raises:
-          ConfigError: if the run ends with an error; the message is the run's.
+          ConfigError: if the run ends with an error; the message is the run's last error line.
         """
         path, at = self.directory / METRICS, 0
         while True:
@@ -79,7 +80,7 @@ class Watched:
             self._asked = True
 
     def summary(self) -> dict[str, Any]:
-        """Reads the run's summary, with device, versions and commit; this process uses no GPU."""
+        """Reads the run's summary, including device, versions and commit, without using a GPU."""
         return report_rows.read_object(self.directory / report_rows.SUMMARY)
 
     def _finish(self) -> None:

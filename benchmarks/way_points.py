@@ -1,9 +1,9 @@
-"""Computes way-points for robots that know the map: shortest paths on a grid of the arena.
+"""Computes way-points for robots that have a map, from shortest paths on a grid of the arena.
 
-A cell is free if a hull fits around its middle. Free cells are connected to their eight neighbours.
-Dijkstra's algorithm from each target gives a path from every cell, so a robot that is pushed off
-its path still has one. Steps close to an obstacle cost more, since paths would otherwise touch
-every corner.
+A cell is free if a hull fits around the middle of the cell. Each free cell is connected to the free
+cells among its eight neighbours. Dijkstra's algorithm from each target gives a path from every
+cell, so a robot that is pushed off its path still has a path. Steps close to an obstacle cost more,
+since paths would otherwise touch every corner.
 """
 
 import importlib
@@ -13,20 +13,20 @@ import numpy as np
 
 from swarmjax.config import ConfigError
 
-CELL = 0.01  # m; in a 0.09 m passage on s6 a centre has 0.016 m, which 0.02 m cells could miss
+CELL = 0.01  # m; 0.02 m cells could miss the 0.016 m for centres in a 0.09 m passage on s6
 COARSE_CELL, LARGE = 0.02, 2.0  # m; COARSE_CELL is for arenas with a side above LARGE
-MARGIN, DEARER = 0.015, 3.0  # steps within MARGIN (m) of the hull's limit cost DEARER times as much
+MARGIN, DEARER = 0.015, 3.0  # steps cost DEARER times as much with under MARGIN m around the hull
 REACH = 24  # maximum distance of a way-point, in cells along the path
-_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # steps to half of a cell's neighbours
+_STEPS = ((0, 1), (1, 0), (1, 1), (1, -1))  # steps to half of the neighbours; others by symmetry
 
 
 class Plan(NamedTuple):
-    """The paths of one arena, with G by G cells.
+    """The paths in one arena of G by G cells.
 
     Attributes:
       cell: edge of a cell, m.
       free: [G, G] whether a hull fits around the middle of a cell; rows are y.
-      nearest: [G * G] the nearest free cell.
+      nearest: [G * G] each cell's nearest free cell.
       following: [R, G * G] the next cell on the path to each robot's target; the cell itself at
         the end, and if there is no path.
     """
@@ -80,7 +80,7 @@ def scipy() -> tuple[Any, Any]:
 
 
 def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarray:
-    """Computes the distances [...] of points [..., 2] to the nearest wall or box, m; 0 inside."""
+    """Computes the distances [...] of points [..., 2] to the nearest wall or box, m; 0 in a box."""
     found = 0.5 * side - np.abs(point).max(axis=-1)
     for x, y, yaw, *half in obstacle:
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -94,7 +94,7 @@ def clearance(point: np.ndarray, side: float, obstacle: np.ndarray) -> np.ndarra
 
 
 def _graph(sparse: Any, free: np.ndarray, room: np.ndarray, cell: float) -> Any:
-    """Connects free cells; returns a symmetric matrix of lengths in m."""
+    """Connects neighbouring free cells; returns a symmetric matrix of step costs in m."""
     count = len(free)
     number = np.arange(free.size).reshape(free.shape)
     price = np.where(room < MARGIN, DEARER, 1.0)
@@ -118,7 +118,7 @@ def _cell_of(place: np.ndarray, cell: float, count: int) -> np.ndarray:
 
 
 def way_points(plan: Plan, place: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Finds each robot's way-point: the furthest point of its path in a free straight line.
+    """Finds each robot's way-point: the furthest path point that a free straight line reaches.
 
     Args:
       plan: plan of the arena.
@@ -140,7 +140,7 @@ def way_points(plan: Plan, place: np.ndarray, target: np.ndarray) -> np.ndarray:
     share = np.linspace(0.0, 1.0, REACH + 1)[:, None, None, None]
     line = place[:, None] + share * (point - place[:, None])
     open_ = plan.free.ravel()[_cell_of(line, plan.cell, count)]
-    # The ends may lie in occupied cells, since robots are pushed there and targets drawn there.
+    # Both ends of a line may be in occupied cells: robots are pushed and targets are drawn there.
     seen = open_[1:-1].all(axis=0)
     furthest = np.where(seen, np.arange(REACH + 1), 1).max(axis=-1)
     return point[robot, furthest]

@@ -1,7 +1,7 @@
 """Draws levels of a suite: `python -m benchmarks.worlds_figure suite=worlds out=FILE.png`.
 
-It shows one level of each cell from above. Walls and boxes are black. Robots are discs, and the
-arrival zones of their targets are circles of the same colour.
+The figure shows one level of each cell of the suite from above. Walls and boxes are black. A robot
+is a disc, and the arrival zone of its target is a circle of the same colour.
 """
 
 import math
@@ -31,7 +31,7 @@ COLUMNS = 5
 
 @dataclass(frozen=True, kw_only=True)
 class WorldsFigureConfig(Section):
-    """What is drawn."""
+    """Settings: what to draw."""
 
     suite: str = field(default="worlds", metadata=about("a name of configs/suites/, or a file"))
     out: str = field(metadata=about("file .png"))
@@ -39,7 +39,7 @@ class WorldsFigureConfig(Section):
 
 
 def draw(chosen: Sequence[CellConfig], number: int, out: Path) -> None:
-    """Draws a level of each cell.
+    """Draws one level of each cell into a file.
 
     Args:
       chosen: The cells.

@@ -1,12 +1,12 @@
-"""Does a curriculum pay on worlds with walls? Compares modes, levels, memory and messages.
+"""Does a curriculum help on worlds with walls? Also compares level replay, memory and messages.
 
 `python -m benchmarks.worlds_study arms=random,adaptive [key=value ...]` trains each arm on the ten
 families of `stage=worlds`, one seed after another in one program. It judges every seed at several
-points of its training, on the device. All arms are judged on the same new levels of every family,
-with the sizes of the suite `worlds`. It prints a JSON line for each arm as soon as it is done. It
-takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
+points of its training, on the device. All arms are judged on the same new levels of each family,
+with the obstacle sizes of the suite `worlds`. It prints a JSON line for each arm as soon as the arm
+is done. It takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
 
-`python -m benchmarks.worlds_table FILE...` makes the table.
+`python -m benchmarks.worlds_table FILE...` makes tables of the results.
 """
 
 import json
@@ -30,7 +30,8 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 from swarmjax.training import seeds
 
-# What all arms share: memory, messages and a critic that sees the state (docs/worlds.md).
+# Settings that all arms share. `_PARTS` adds memory, messages and a critic that sees the state
+# (docs/worlds.md).
 RECIPE = [
     "seeds=10",
     "seeds_by=map",
@@ -87,7 +88,7 @@ _PARTS = {
     "messages": ["task.neighbours.count=4", "task.neighbours.message_size=2"],
     "state": ["algo.critic=state"],
 }
-# The sizes of the suite `worlds`; the stages for training have ranges instead.
+# Obstacle sizes of the suite `worlds`; the stages for training have ranges of sizes instead.
 HARDEST: dict[str, dict[str, Any]] = {
     "trap": {"width": 0.3, "depth": 0.3},
     "fence": {"length": 0.6},
@@ -116,15 +117,15 @@ def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
     """Makes the config of one arm.
 
     Args:
-      study: The study.
+      study: The settings of the study.
       arm: One of the study's arms.
-      words: `key=value` words for training; they override the recipe.
+      words: `key=value` arguments for training, which override the recipe.
 
     Returns:
       The config.
 
     Raises:
-      ConfigError: If a word is invalid.
+      ConfigError: If an argument is invalid.
     """
     parts = [word for name, mine in _PARTS.items() if name != study.without for word in mine]
     found = load_train([*RECIPE, *parts, *ARMS[arm], *words])
@@ -134,7 +135,7 @@ def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
 
 
 def _hardest(stage: StageConfig) -> StageConfig:
-    """Gives a stage the sizes of the suite `worlds`."""
+    """Returns a stage with the obstacle sizes of the suite `worlds`."""
     return replace(stage, **HARDEST.get(stage.level, {}))
 
 
@@ -190,7 +191,7 @@ def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _line(study: Study, arm: Arm, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:
-    """Returns the entries of a line that describe an arm."""
+    """Returns the entries of a result line that describe the arm."""
     return {
         "benchmark": "worlds_study",
         "arm": arm if study.without == "nothing" else f"{arm}, without {study.without}",

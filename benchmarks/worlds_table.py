@@ -1,8 +1,8 @@
 """Makes tables from the lines that `benchmarks.worlds_study` has printed.
 
-`python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first table has an arm
-in each row, with interquartile means over seeds and families and 95 % intervals of a stratified
-bootstrap (swarmjax.evaluate.statistics):
+`python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first table has a row
+for each arm, with interquartile means over seeds and families. Their 95 % intervals come from a
+stratified bootstrap (swarmjax.evaluate.statistics). The columns are:
 
 - `all arrive`: share of levels in which all robots arrive, at the end of training.
 - `to 0.9`: arena steps until a seed's mean over the families first reaches 0.9.
@@ -10,7 +10,8 @@ bootstrap (swarmjax.evaluate.statistics):
 - `contacts`: contacts per robot.
 - `P(better)`: probability that a seed does better on a family than a seed of `random`.
 
-The second table has a family in each row, and for every arm the mean of `all arrive` over seeds.
+The second table has a row for each family and a column for each arm, with the mean of `all arrive`
+over seeds.
 """
 
 import json
@@ -93,7 +94,7 @@ def _joined(one: Line, other: Line) -> Line:
 
 
 def curves(line: Line, measure: str) -> np.ndarray:
-    """Returns the results of an arm, [N seeds, F families, P points]."""
+    """Returns an arm's values of a measure, [N seeds, F families, P points]."""
     return np.stack([np.array(found[measure]) for found in line["judged"].values()], axis=1)
 
 
@@ -107,7 +108,7 @@ def arms_table(arms: dict[str, Line]) -> str:
 
 
 def _cells(line: Line, baseline: Line | None) -> list[str]:
-    """Makes the cells of an arm."""
+    """Makes the table cells for the row of an arm."""
     arrive = curves(line, "all_reached")
     end, contacts = arrive[..., -1], curves(line, "contacts_per_robot")[..., -1]
     to = steps_to(line["arena_steps"], arrive.mean(axis=1), THRESHOLD)

@@ -20,9 +20,9 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "stage=s6 robot=wheeled budget=8e6 arenas=512": "one stage, on wheels",
         "run.dir=runs/first seeds=4": "four seeds at once, into a folder of your choice",
         "stage=curriculum 'stage.sequence=[s1,s3,s6]'": "a curriculum of three stages",
-        "init_from=runs/first realism=real": "from what a run learned, on realistic robots",
+        "init_from=runs/first realism=real": "start from a trained run, on realistic robots",
         "resume=runs/first": "go on with a run that was stopped",
-        "stage=s6 run.dry=true": "compile, say what the run needs, and train nothing",
+        "stage=s6 run.dry=true": "compile and print the memory that the run needs",
     },
     "swarmjax.evaluate": {
         "policy=runs/first/policy.npz": "1,000 levels of its last stage, on wheels",
@@ -43,7 +43,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
-        "run=runs/first send=true": "and into the run's TensorBoard or W&B",
+        "run=runs/first send=true": "also send it to the run's TensorBoard or W&B",
         "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.watch": {
@@ -187,7 +187,7 @@ def _overview(cls: type[Section], module: str) -> list[str]:
         lines += ["", "Keys, with their defaults:", *section.describe_keys(cls, top)]
     inner = section.sections(cls)
     if inner:
-        lines += ["", f"Sections of keys; {command} --help all lists them all:"]
+        lines += ["", f"Sections of keys; {command} --help all lists all keys:"]
     for name, each in inner.items():
         meaning = (inspect.getdoc(each) or "").partition("\n")[0].rstrip(".:;")
         lines.append(f"  {f'--help {name}':<38}  {name}.*: {meaning}")

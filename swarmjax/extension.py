@@ -232,8 +232,8 @@ def load(source: str | None) -> Extensions:
     if source.startswith(_HANDED):
         if source not in _handed:
             raise ConfigError(
-                f"extensions is {source}, which stands for pieces that only the Python program "
-                "itself had: put them into a file and give extensions=FILE."
+                f"extensions is {source}, which stands for pieces that were defined only in a "
+                "Python program: put them into a file and give extensions=FILE."
             )
         return _handed[source]
     path = Path(source)
@@ -435,5 +435,6 @@ def check_needs(
             if there != digest:
                 raise ConfigError(
                     f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but the "
-                    f"one in extensions has {there[:12]}: give the file as it was then."
+                    f"{kind} in extensions has digest {there[:12]}: give the version of the file "
+                    "that was used for training."
                 )

@@ -144,7 +144,7 @@ def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
 def _text(array: np.ndarray) -> str:
     if array.dtype.kind == "U" and not array.shape and array.itemsize <= 4 * MAX_LETTERS:
         return array.item()
-    raise ValueError(f"meta or digest is not a text of at most {MAX_LETTERS} letters")
+    raise ValueError(f"meta or digest is not a text of at most {MAX_LETTERS} characters")
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:

@@ -213,7 +213,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if heard.size > size:
         raise PolicyError(
             f"meta.observation.neighbours takes {heard.size} entries, but meta.observation.names "
-            f"has {size}: expected the neighbours' entries among them."
+            f"has {size}: expected names to include the neighbours' entries."
         )
     actions = _check_action(meta["action"], heard.messages)
     _check_embodiment(meta)
@@ -355,7 +355,7 @@ def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     found = policy.digest(members)
     if found != expected:
         raise PolicyError(
-            f"digest is {_show(expected[:12])}..., but that of the content is "
+            f"digest is {_show(expected[:12])}..., but the content has digest "
             f"{_show(found[:12])}...: the file was changed or damaged."
         )
     del members["meta"]
@@ -380,7 +380,7 @@ def _unpack(content: bytes) -> dict[str, bytes]:
         # zipfile quotes a damaged header in full, which does not help a reader.
         said = str(error).strip().partition(" and header ")[0] or type(error).__name__
         reason = _plain(said.splitlines()[0].rstrip("."))
-        raise PolicyError(f"it is no npz archive that can be read: {reason[:200]}.") from None
+        raise PolicyError(f"it is not a readable npz archive: {reason[:200]}.") from None
 
 
 def _check_total(total: int, most: int) -> None:
@@ -397,7 +397,7 @@ def _check_member(member: zipfile.ZipInfo, found: Set[str]) -> None:
     if not _MEMBER.fullmatch(name):
         raise PolicyError(f"{_show(name)} is not known: format {FORMAT} has no such member.")
     if name in found:
-        raise PolicyError(f"{_show(name)} is there more than once: expected each member once.")
+        raise PolicyError(f"{_show(name)} appears more than once: expected each member once.")
     if member.flag_bits & 1 or member.compress_type != zipfile.ZIP_STORED:
         raise PolicyError(f"{_show(name)} is compressed or encrypted: expected stored members.")
 
@@ -420,7 +420,9 @@ def _parse_array(name: str, data: bytes) -> np.ndarray:
     try:
         return np.ndarray(shape, dtype, data, start)
     except ValueError:  # one axis is 0, and the product of the others is too large for NumPy
-        raise PolicyError(f"{name} has shape {list(shape)}: expected no axis of 0.") from None
+        raise PolicyError(
+            f"{name} has shape {list(shape)}: expected no axis of length 0."
+        ) from None
 
 
 def _text(members: Mapping[str, np.ndarray], name: str) -> str:
@@ -428,7 +430,7 @@ def _text(members: Mapping[str, np.ndarray], name: str) -> str:
     if array is None:
         raise PolicyError(f"{name} is missing: the file is not a policy of format {FORMAT}.")
     if array.shape != () or not array.dtype.str.startswith("<U"):
-        raise PolicyError(f"{name} is {array.dtype} {list(array.shape)}: expected one text.")
+        raise PolicyError(f"{name} is {array.dtype} {list(array.shape)}: expected a single string.")
     try:
         return str(array.reshape(-1).view(np.uint8).data, "utf-32-le").rstrip("\0")
     except UnicodeDecodeError:
@@ -438,7 +440,8 @@ def _text(members: Mapping[str, np.ndarray], name: str) -> str:
 def _parse_meta(text: str) -> dict[str, Any]:
     if len(text) > MAX_LETTERS or sum(map(text.count, "[{,:")) > MAX_ENTRIES:
         raise PolicyError(
-            f"meta cannot be read: expected at most {MAX_LETTERS} letters, {MAX_ENTRIES} entries."
+            f"meta cannot be read: expected at most {MAX_LETTERS} characters and {MAX_ENTRIES} "
+            "entries."
         )
     try:
         meta = parse_json(text, "meta")
@@ -562,8 +565,8 @@ def _check_action(layout: Mapping[str, Any], messages: int) -> int:
     if (np.array(high, np.float32) <= 0).any() or not sound:
         raise PolicyError(
             f"meta.action.low is {_show(low)} and high is {_show(high)}: expected "
-            "a speed from 0 up and a turn rate within plus or minus one limit"
-            f"{', and messages within -1 to 1' if messages else ''}."
+            "a speed from 0 to high and a turn rate from -high to high"
+            f"{', and messages from -1 to 1' if messages else ''}."
         )
     return len(every[0])
 
@@ -638,7 +641,7 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise PolicyError(f"{name} has shape {list(array.shape)}: expected {list(shape)}.")
     if not array.size:
-        raise PolicyError(f"{name} has shape {list(array.shape)}: expected no axis of 0.")
+        raise PolicyError(f"{name} has shape {list(array.shape)}: expected no axis of length 0.")
     if not np.isfinite(array).all():
         raise PolicyError(f"{name} holds a value that is not finite: expected numbers.")
 

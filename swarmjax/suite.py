@@ -56,7 +56,7 @@ class SuiteConfig(Section):
     steps: int | None = field(
         default=None,
         metadata=about(
-            f"control steps of an episode; null: the cell's, else {STEPS}", 1, MOST_STEPS
+            f"control steps of an episode; null: as in the cell, else {STEPS}", 1, MOST_STEPS
         ),
     )
     workers: int | None = field(

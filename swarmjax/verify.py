@@ -142,7 +142,7 @@ def _verdict(run: str, updates: list[int], differing: list[int]) -> str:
             "trained it, or its device does not compute the same bits twice."
         )
     what = words.count(len(updates), "checkpoint")
-    return f"{run} is bit for bit what it was, to update {updates[-1]:,} ({what} compared)."
+    return f"{run} was reproduced bit for bit, up to update {updates[-1]:,} ({what} compared)."
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Chromium without a window, for tests of the pages that this project writes."""
+"""Starts headless Chromium, for tests of the pages that this project writes."""
 
 import shutil
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ _FLAGS = (
 
 
 def browsers(profile: Path) -> Iterator[Any]:
-    """Yields one browser, which notes its requests and its console, and closes it afterwards."""
+    """Yields a browser that logs its requests and its console, and closes it afterwards."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     from selenium.webdriver.chrome.service import Service
 

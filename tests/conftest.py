@@ -1,9 +1,10 @@
-"""One tiny configuration, compiled once and kept between runs, for every test that simulates."""
+"""Shares a tiny configuration, compiled once and kept between runs, with tests that simulate."""
 
 import os
 
-os.environ["JAX_PLATFORMS"] = "cpu"  # before anything imports JAX
-# Most of the time is compiling, which takes two thirds as long so; proofs with `-m slow` as well.
+os.environ["JAX_PLATFORMS"] = "cpu"  # Set before anything imports JAX.
+# Tests spend most of their time compiling, which optimisation level 0 cuts to two thirds. The slow
+# tests of `-m slow` use it as well.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 
 import functools
@@ -29,7 +30,7 @@ hypothesis.settings.register_profile("swarmjax", deadline=None, derandomize=True
 hypothesis.settings.load_profile("swarmjax")
 
 
-# Files that take longest begin first, so that both processes end at about the same time.
+# The files that take longest begin first, so that both test processes end at about the same time.
 LONGEST = (
     "training/test_mesh.py",
     "run/test_reliability.py",
@@ -54,8 +55,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled programs in `.pytest_cache`, so that a second run compiles less.
 
-    Each process has its own, with the commands that it starts: one may read what another has half
-    written. Without `.pytest_cache` nothing is kept: a test never touches the user's cache.
+    Each test process shares a cache with the commands that it starts, but not with other test
+    processes, since a process may read a file that another one has half written. Without
+    `.pytest_cache` nothing is kept, so a test never touches the user's cache.
     """
     cache = getattr(config, "cache", None)  # absent with -p no:cacheprovider
     if cache is None:
@@ -71,13 +73,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def tiny_config() -> TrainConfig:
-    """The smallest run that has everything: two stages, absent robots, obstacles, minibatches."""
+    """Returns a minimal run that has two stages, absent robots, obstacles and minibatches."""
     return TrainConfig(
         stage=(
             StageConfig(name="pair", robots=2, side=0.5),
             StageConfig(name="trio", robots=3, side=0.8, obstacles=2),
         ),
-        # Equation 3 alone, whose sums are easily worked out.
+        # The reward is equation 3 of the paper alone, whose sums are easily computed by hand.
         task=TaskConfig(
             step_limit=16, reward=RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
         ),
@@ -95,5 +97,8 @@ def tiny_world(tiny_config: TrainConfig) -> World:
 
 @pytest.fixture(scope="session")
 def tiny_step(tiny_world: World) -> ArenaStep:
-    """One control step of 8 arenas: state with the physics' data, action [8, 3, 2]."""
+    """Returns the compiled control step of 8 arenas.
+
+    The step takes a state with the physics' data, and actions [8, 3, 2].
+    """
     return jax.jit(jax.vmap(functools.partial(env.step, tiny_world)))

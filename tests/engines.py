@@ -1,4 +1,4 @@
-"""The three engines behind one interface: MJX by `jax` and by `warp`, and MuJoCo C, either body."""
+"""Runs three engines through one interface: MJX by `jax`, MJX by `warp`, and MuJoCo C."""
 
 import dataclasses
 from collections.abc import Callable
@@ -26,7 +26,7 @@ ENGINES = [(impl, body) for body in ("planar", "wheeled") for impl in ("jax", "w
 
 
 class Path(NamedTuple):
-    """What came of driving, [T, A, R, ...]: x, y, yaw; velocities of the joints."""
+    """The result of driving, [T, A, R, ...]: poses (x, y, yaw) and joint velocities."""
 
     pose: np.ndarray
     rate: np.ndarray
@@ -36,10 +36,10 @@ CHUNK = 20  # control steps of one call of `Engine.run`
 
 
 class Engine(NamedTuple):
-    """The physics of one implementation, and its compiled steps of all arenas.
+    """The physics of one implementation, and its compiled control steps of all arenas.
 
-    `run` takes the model, data, side, obstacle, wheels [T, A, R, 2] and chassis, and returns the
-    data after, and qpos and qvel of every control step.
+    `run` takes the model, data, side, obstacle, wheels [T, A, R, 2] and chassis. It returns the
+    final data, and qpos and qvel of every control step.
     """
 
     config: TrainConfig
@@ -48,7 +48,7 @@ class Engine(NamedTuple):
 
 
 def settings(impl: Literal["jax", "warp"], body: BodyName) -> TrainConfig:
-    """Three robots and two obstacles."""
+    """Returns settings with three robots and two obstacles."""
     stage = StageConfig(
         name="boxes", robots=ROBOTS, side=1.3, obstacles=OBSTACLES, obstacle_size=2 * BIGGEST_HALF
     )
@@ -58,12 +58,12 @@ def settings(impl: Literal["jax", "warp"], body: BodyName) -> TrainConfig:
 
 
 def load(impl: Literal["jax", "warp"], body: BodyName) -> Engine:
-    """Three robots and two obstacles, ready to drive."""
+    """Loads an engine with three robots and two obstacles."""
     return load_as(settings(impl, body))
 
 
 def load_as(config: TrainConfig) -> Engine:
-    """Compiles; the model is an argument of the step, so that its numbers may change."""
+    """Loads an engine whose `run` takes the model as an argument, so that tests may change it."""
     loaded = programs.load_world(config).physics
 
     def run(model: Any, data: Any, side: Any, obstacle: Any, wheels: Any, chassis: Any) -> Any:
@@ -81,14 +81,14 @@ def load_as(config: TrainConfig) -> Engine:
 
 
 def start(engine: Engine, pose: np.ndarray) -> Any:
-    """Arenas [A] at rest at poses [A, R, 3] or [R, 3]."""
+    """Returns the data of arenas [A] at rest, with robots at poses [A, R, 3] or [R, 3]."""
     pose = np.broadcast_to(pose, (ARENAS, ROBOTS, 3)).astype(np.float32)
     state = jax.vmap(lambda p: physics.rest(engine.loaded, p))(jnp.asarray(pose))
     return jax.vmap(lambda s: physics.unpack(engine.loaded, s))(state)
 
 
 def wheels_of(velocity: np.ndarray) -> np.ndarray:
-    """Wheel speeds [..., 2] of forward speed and turn rate [..., 2], nothing clamped."""
+    """Returns unclamped wheel speeds [..., 2] for forward speed and turn rate [..., 2]."""
     free = drive.from_config(RobotConfig())._replace(max_wheel_speed=np.inf)
     return drive.wheel_speeds(np.asarray(velocity, np.float64), free, np)
 
@@ -103,12 +103,13 @@ def drive_all(
     chassis: Chassis = AS_BUILT,
     model: Any = None,
 ) -> Path:
-    """Holds wheel speeds [T, A, R, 2] or [T, 2], from poses at rest."""
+    """Drives all arenas from rest at these poses, with wheel speeds [T, A, R, 2] or [T, 2]."""
     data, found, count = start(engine, pose), [], len(wheels)
     if wheels.ndim == 2:
         wheels = wheels[:, None, None]
     wheels = np.broadcast_to(wheels, (count, ARENAS, ROBOTS, 2)).astype(np.float32)
-    # Whole chunks, so that one program serves all tests; what is driven beyond is dropped.
+    # The steps are padded to whole chunks, so that one program serves all tests. The results of the
+    # padding are dropped.
     wheels = np.concatenate([wheels, np.repeat(wheels[-1:], -count % CHUNK, axis=0)])
     model = engine.loaded.engine.model if model is None else model
     for now in wheels.reshape(-1, CHUNK, ARENAS, ROBOTS, 2):
@@ -123,7 +124,7 @@ def drive_all(
 def compile_in_c(
     robot: RobotConfig, obstacle: np.ndarray, steps: int, fixtures: model.Fixtures = "mocap"
 ) -> Any:
-    """The same model in MuJoCo C, in float64, its solver converged."""
+    """Compiles the same model for MuJoCo C in float64, with a solver that runs to convergence."""
     size = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
     spec = model.build(robot, size, STEP / steps, fixtures=fixtures)
     spec.option.iterations, spec.option.tolerance = 100, 1e-14
@@ -142,7 +143,7 @@ def drive_in_c(
     side: float = 0.6,
     built: mujoco.MjModel | None = None,
 ) -> Path:
-    """One arena [R, 3] by MuJoCo C; wheels [T, R, 2]; the path is [T, 1, R, ...]."""
+    """Drives one arena [R, 3] in MuJoCo C, with wheels [T, R, 2]; the path is [T, 1, R, ...]."""
     given: Any = built or compile_in_c(robot, obstacle, physics_substeps(robot, None))
     count = round(STEP / given.opt.timestep)
     data, body = mujoco.MjData(given), model.BODIES[robot.body]
@@ -160,7 +161,7 @@ def drive_in_c(
 
 
 def push(built: mujoco.MjModel, data: mujoco.MjData, robot: RobotConfig, ctrl: np.ndarray) -> None:
-    """Moves MuJoCo C on by a physics step with servos that are forces, by what they are now."""
+    """Advances MuJoCo C by one physics step, with the servos' present forces applied."""
     servos, now = model.BODIES[robot.body].servos, (data.qpos, data.qvel, ctrl)
     assert servos is not None
     data.qfrc_applied = servos.force(*now, AS_BUILT, robot, built.opt.timestep, np)
@@ -168,10 +169,10 @@ def push(built: mujoco.MjModel, data: mujoco.MjData, robot: RobotConfig, ctrl: n
 
 
 def turned(yaw: np.ndarray) -> np.ndarray:
-    """An angle [..] brought to -pi..pi."""
+    """Wraps angles [...] to -pi..pi."""
     return (np.asarray(yaw) + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def alone(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    """One robot at a pose [R, 3], the others far from it and from everything else."""
+    """Returns poses [R, 3]: robot 0 at this pose, the other robots far from everything."""
     return np.array([[x, y, yaw], [5.0, 5.0, 0.0], [5.5, 5.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Where quantities lie in an observation, for the tests of all who look into one."""
+"""Indices of the quantities in an observation, for tests that look into observations."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ KNOWN = np.array([*range(INFRARED.start, INFRARED.stop), *TARGET])
 def by_name(
     names: tuple[str, ...], infrared: float, distance: float, bearing: float, other: float
 ) -> np.ndarray:
-    """Puts a number for each entry [O] together; `other` is that of entries not known here."""
+    """Returns a number for each entry [O]; `other` is the number of all entries not named here."""
     known = {f"infrared_{i}": infrared for i in range(epuck.SENSORS)}
     known |= {"target_distance": distance, "target_bearing": bearing}
     return np.array([known.get(name, other) for name in names])

@@ -1,4 +1,4 @@
-"""Files with pieces of somebody's own, for the tests of all who take them."""
+"""Extension files with custom pieces, for tests of the code that loads them."""
 
 from pathlib import Path
 
@@ -15,6 +15,6 @@ from swarmjax.extension import level_drawing, network, observation, reward_term
 
 
 def write(path: Path, body: str) -> str:
-    """Writes a file of pieces and returns its path as a word."""
+    """Writes an extension file with this body and returns its path as a string."""
     path.write_text(HEAD + body)
     return str(path)

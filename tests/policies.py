@@ -1,4 +1,4 @@
-"""Policies written by hand, for the tests of all who read or export them."""
+"""Builds policies by hand, for tests of the code that reads or exports them."""
 
 import copy
 import json
@@ -34,7 +34,7 @@ EMBODIMENT = {
 def observed(
     encoding: observation.Encoding = "metric", names: Names = observation.NAMES
 ) -> dict[str, Any]:
-    """What `meta` says of observations that have these entries alone."""
+    """Returns the `observation` part of `meta` for observations with only these entries."""
     full = observation.describe(encoding)
     at = [full["names"].index(name) for name in names]
     parts = {key: [full[key][i] for i in at] for key in ("names", "units", "offset", "scale")}
@@ -42,7 +42,7 @@ def observed(
 
 
 def meta(**changes: Any) -> dict[str, Any]:
-    """All that `policy_file.write` takes beside the arrays of `arrays`."""
+    """Returns the `meta` that `policy_file.write` takes with the arrays of `arrays`."""
     full = {
         "policy": "shared",
         "learners": 1,
@@ -63,7 +63,7 @@ def meta(**changes: Any) -> dict[str, Any]:
 
 
 def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
-    """The same networks with a memory of `size` before the last layer, which takes it besides."""
+    """Returns these networks with a memory of `size` numbers, a further input of the last layer."""
     draw = np.random.default_rng(seed)
     kernel = given["actor/mean/kernel"]
     learners, width, actions = kernel.shape
@@ -78,7 +78,7 @@ def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
 
 
 def stacked(given: Arrays, history: int, seed: int = 2) -> Arrays:
-    """The same networks, which take the observations before besides."""
+    """Returns these networks with previous observations as further inputs, `history` in all."""
     draw = np.random.default_rng(seed)
     kernel = given["actor/hidden_0/kernel"]
     learners, size, width = kernel.shape
@@ -93,7 +93,7 @@ def stacked(given: Arrays, history: int, seed: int = 2) -> Arrays:
 
 
 def recalling(kind: str, given: Arrays, size: int, **said: Any) -> tuple[Arrays, dict[str, Any]]:
-    """These networks with a `gru` of `size` numbers or a `history` of `size`, and their `meta`."""
+    """Returns these networks with a `gru` or a `history` of this size, and their `meta`."""
     if kind == "gru":
         return remembering(given, size), said | {"memory": {"kind": "gru", "size": size}}
     layout = said.get("observation", observed()) | {"history": size}
@@ -103,7 +103,7 @@ def recalling(kind: str, given: Arrays, size: int, **said: Any) -> tuple[Arrays,
 def hearing(
     given: Arrays, count: int, messages: int, seed: int = 3, **said: Any
 ) -> tuple[Arrays, dict[str, Any]]:
-    """These networks with neighbours that are heard and messages besides, and their `meta`."""
+    """Returns these networks with inputs from neighbours and message actions, and their `meta`."""
     heard = NeighboursConfig(count=count, message_size=messages)
     draw, found = np.random.default_rng(seed), dict(given)
     learners, _, width = given["actor/hidden_0/kernel"].shape
@@ -131,7 +131,7 @@ def hearing(
 
 
 def several(learners: int) -> dict[str, Any]:
-    """What `meta` says of so many learners."""
+    """Returns the entries of `meta` for this number of learners."""
     return {"policy": "shared" if learners == 1 else "independent", "learners": learners}
 
 
@@ -141,10 +141,10 @@ def arrays(
     seed: int = 0,
     names: Names = observation.NAMES,
 ) -> Arrays:
-    """Networks whose actions are some units large and depend on all that is observed.
+    """Returns networks whose actions are a few units large and depend on every observed entry.
 
-    The normaliser's mean and deviation are those of a robot between walls: centimetres of
-    infrared, decimetres of distance, radians of bearing.
+    The normaliser's mean and deviation are those of a robot between walls: centimetres for
+    infrared, decimetres for distance, radians for bearing.
     """
     draw = np.random.default_rng(seed)
     sizes = (len(names), *hidden, 2)
@@ -169,13 +169,13 @@ def saved(path: Path, given: Arrays | None = None, **changes: Any) -> Policy:
 
 
 def saved_for_webots(path: Path) -> Policy:
-    """Writes a policy that observes what the controller can measure, and nothing else."""
+    """Writes and reads a policy that observes only what the Webots controller can measure."""
     names = webots_controller.QUANTITIES
     return saved(path, arrays(names=names), observation=observed(names=names))
 
 
 def forge(path: Path, given: Arrays, said: Any, digest: str | None = None) -> None:
-    """Writes a file without any check, its digest right unless one is given."""
+    """Writes a file without any check; the digest is correct unless one is given."""
     text = said if isinstance(said, str) else json.dumps(said)
     whole = given | {"meta": np.array(text)}
     whole["digest"] = np.array(policy.digest(whole) if digest is None else digest)
@@ -183,11 +183,11 @@ def forge(path: Path, given: Arrays, said: Any, digest: str | None = None) -> No
 
 
 def seen(trained: Policy, count: int, seed: int = 0) -> np.ndarray:
-    """Draws observations [count, R, O] of a metric policy, R its learners.
+    """Draws observations [count, R, O] for a metric policy with R learners.
 
-    Half lie in their physical ranges: 0 to 4 cm of infrared, 0 to 2.2 m, -pi to pi, -1 to 1 of
-    what is not known here. The others reach half as far again as the normaliser's limit, where it
-    clips them.
+    Half of the observations lie in their physical ranges: infrared 0 to 4 cm, distance 0 to 2.2 m,
+    bearing -pi to pi, other entries -1 to 1. The other half reach up to 1.5 times the normaliser's
+    limit, so that some are clipped.
     """
     draw = np.random.default_rng(seed)
     size = trained.mean.shape[1] // trained.history

@@ -1,4 +1,4 @@
-"""What policies do on small stages, for the tests of replays."""
+"""Records policies on small stages, for the tests of replays."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
 
 
 def judge(settings: ReplayConfig) -> Judge:
-    """The judge of the first policy on the stage of a replay."""
+    """Returns the judge of a replay's first policy on its stage."""
     cell = cells.load(settings.evaluation).cells[0]
     (entrant,) = trials.read_policies(settings.policies[:1])
     return evaluate_judge.load(settings.evaluation, entrant.policy, cell.half)
@@ -31,13 +31,14 @@ def recorded(path: Path, *words: str) -> tuple[Judge, list[Recording]]:
 
 
 def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
-    """A recording that is hard to pack: all but what stands still is random at every step.
+    """Returns a recording that compresses badly: everything that moves is random at every step.
 
-    A ray in fifty is lit, a robot in fifty touches something, and a contact in a hundred begins.
+    In each step one ray in 50 is lit, one robot in 50 touches something, and one robot in 100
+    begins a contact.
     """
     draw = np.random.default_rng(seed)
     stride = draw.uniform(-4e-3, 4e-3, (frames, robots, 2))  # m; full speed for a control step
-    turn = draw.uniform(-0.1, 0.1, (frames, robots, 1))  # rad; full turn rate likewise
+    turn = draw.uniform(-0.1, 0.1, (frames, robots, 1))  # rad; full turn rate for a control step
     lit = draw.random((frames, robots, 8)) < 0.02
     begins = draw.random((frames, robots, 3)) < 0.01 / 3
     earning = {
@@ -66,5 +67,5 @@ def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
 
 
 def episode(*runs: Recording, level: int = 0) -> ReplayEpisode:
-    """An episode of these runs."""
+    """Returns a replay episode of these runs."""
     return ReplayEpisode(f"level {level}", level, list(runs))

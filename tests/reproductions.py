@@ -1,4 +1,4 @@
-"""Reproductions of the paper whose numbers are known beforehand."""
+"""Builds reproductions of the paper whose numbers are known."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ FACTS = {
 
 
 def episode(number: int, **given: Any) -> dict[str, Any]:
-    """An episode of two robots that both arrive: 100 steps, the number-th of its seed from 1."""
+    """Returns episode `number` of a seed, counted from 1: two robots arrive in 100 steps."""
     robots = len(given.get("reached", (True, True)))
     return {
         "seed": 0,
@@ -42,7 +42,7 @@ def episode(number: int, **given: Any) -> dict[str, Any]:
 
 
 def row(arm: str, seed: int, stage: str, **given: Any) -> dict[str, Any]:
-    """A row of the evaluation."""
+    """Returns a row of the evaluation."""
     shares = {"targets_reached": 0.9, "all_reached": 0.6, "sensed_share": 0.1}
     rest = {"contacts_per_robot": 1.5, "return": 0.8, "steps": 300.0}
     where = {"arm": arm, "seed": seed, "stage": stage, "episodes": 20}
@@ -55,7 +55,7 @@ def write(
     judged: Sequence[Mapping[str, Any]] | None = None,
     **facts: Any,
 ) -> Path:
-    """Writes a directory in which the arms of the logs have finished."""
+    """Writes a directory in which the arms in `logs` have finished."""
     finished = dict.fromkeys(logs, 60.0)
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(FACTS | {"seconds": finished, "compile_s": finished} | facts)
@@ -73,7 +73,7 @@ def write(
 
 
 def whole(out: Path, episodes: int = 30, arms: Sequence[str] = tuple(ARMS)) -> Path:
-    """Writes arms that fail in their first ten episodes, baselines in twelve, and then never."""
+    """Writes arms that fail only in their first ten episodes (baselines in their first twelve)."""
     logs = {}
     for arm in arms:
         stage = EXPANDED if arm.endswith("_expanded") else LAST
@@ -92,7 +92,7 @@ def whole(out: Path, episodes: int = 30, arms: Sequence[str] = tuple(ARMS)) -> P
 
 
 def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> RunLog:
-    """A seed's episodes of two robots, which arrive together or not at all."""
+    """Returns a seed's episodes of two robots, which arrive together or not at all."""
     count = len(successes)
     both = np.repeat(np.asarray(successes, bool)[:, None], 2, axis=1)
     ones = np.ones((count, 2), int)
@@ -115,7 +115,7 @@ def reproduction(
     logs: Mapping[str, Sequence[RunLog]] | None = None,
     judged: Mapping[tuple[str, str], Mapping[str, float]] | None = None,
 ) -> Reproduction:
-    """What arms came to: every measure that is not given is 0 for all seeds."""
+    """Returns a reproduction in which every measure that is not given is 0 for all seeds."""
     logs, judged = logs or {}, judged or {}
     arms = [*logs, *(arm for arm, _ in judged if arm not in logs)]
     zero = dict.fromkeys(JUDGED, 0.0)

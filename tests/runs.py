@@ -1,4 +1,4 @@
-"""Run directories written by hand, for the tests of the report."""
+"""Writes run directories by hand, for the tests of the report."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,7 @@ CONFIG = TrainConfig(
 
 
 def row(update: int, seed: int = 0, **given: object) -> dict:
-    """A row of metrics.jsonl, all arenas on the first of two stages, nothing measured yet."""
+    """Returns a row of metrics.jsonl: all arenas are on stage 1 of 2, and nothing is measured."""
     return {
         "seed": seed,
         "update": update,

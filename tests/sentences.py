@@ -1,4 +1,4 @@
-"""A refusal is one sentence."""
+"""Checks that a refusal is one sentence."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from swarmjax.config import ConfigError
 
 
 def refusal(function, *arguments) -> str:
-    """Return the sentence with which a call is refused, and hold it to being one."""
+    """Returns the message with which a call is refused, and checks that it is one sentence."""
     with pytest.raises(ConfigError) as caught:
         function(*arguments)
     sentence = str(caught.value)

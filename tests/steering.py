@@ -1,4 +1,4 @@
-"""Policies written by hand, which steer by the bearing of their target alone."""
+"""Writes policies by hand that steer only by the bearing of their target."""
 
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from swarmjax.task import observation
 
 SPEED = 0.1256  # m/s, the largest command
 STEP = 0.032  # s, a control step
-STRIDE = SPEED * STEP  # m; the servo has the speed within one control step
-NO_NOISE = -200.0  # the logarithm of a deviation that is 0 in float32
-# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
+STRIDE = SPEED * STEP  # m; the servo reaches the speed within one control step
+NO_NOISE = -200.0  # The logarithm of a deviation that is 0 in float32.
+# A policy's action at bearing 0, then its change per radian of bearing to the left and to the
+# right.
 STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
 AHEAD = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
@@ -27,7 +28,7 @@ def write(
     log_std: float | np.ndarray = NO_NOISE,
     **meta: Any,
 ) -> Path:
-    """Writes a policy of one hidden layer, relu(bearing) and relu(-bearing)."""
+    """Writes a policy whose one hidden layer has the units relu(bearing) and relu(-bearing)."""
     bearing = np.zeros((1, observation.SIZE, 2))
     bearing[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
     zero = np.zeros((1, observation.SIZE))

@@ -1,4 +1,4 @@
-"""swarmjax from Python: the four functions, and what they refuse."""
+"""Tests the four functions of swarmjax's Python interface, and what they refuse."""
 
 import importlib
 import pkgutil
@@ -42,7 +42,7 @@ def env() -> Swarm:
 
 @pytest.fixture(scope="module")
 def states(env: Swarm) -> list[SwarmState]:
-    """The states of 14 control steps in which every robot stands still."""
+    """Returns the first state and the state after each of 14 control steps without motion."""
     state = jax.jit(env.reset)(jax.random.key(0))
     step, found = jax.jit(env.step), [state]
     still = jnp.tile(jnp.array([-1.0, 0.0]), (ARENAS, env.num_robots, 1))
@@ -86,7 +86,7 @@ def test_an_episode_that_is_over_gives_way_to_another(states: list[SwarmState]) 
     start = [np.array(state.arenas.level.start) for state in states]
     for before, after in zip(range(LIMIT - 1), range(1, LIMIT), strict=True):
         np.testing.assert_array_equal(start[before], start[after])
-    for arena in range(ARENAS):  # each has another level after the step limit, and after the next
+    for arena in range(ARENAS):  # each has a new level after every step limit
         assert len({start[i][arena].tobytes() for i in (0, LIMIT, 2 * LIMIT)}) == 3
     np.testing.assert_array_equal(states[LIMIT].arenas.clock, 0)
 
@@ -115,7 +115,7 @@ def test_it_runs_under_vmap_as_alone(env: Swarm, states: list[SwarmState]) -> No
     action = jnp.zeros((2, ARENAS, env.num_robots, 2))
     after, _ = jax.jit(jax.vmap(env.step))(pair, action)
     alone, _ = jax.jit(env.step)(states[0], action[0])
-    # XLA fuses a batch otherwise, and rounds otherwise.
+    # XLA fuses a batch differently, so it rounds differently.
     np.testing.assert_allclose(after.observation[0], alone.observation, atol=1e-5)
 
 
@@ -174,7 +174,7 @@ def test_a_policy_with_a_history_is_trained_and_judged(tmp_path: Path) -> None:
     result = swarmjax.train_policy(settings)
     assert result.policy.meta["observation"]["history"] == 3
     assert result.policy.mean.shape == (1, 30)
-    # After one update: what was seen before has been learned from too, and normalised.
+    # After one update the normaliser has statistics of the previous observations as well.
     assert np.ptp(result.policy.std) > 0.0
     found = swarmjax.evaluate_policy(result.policy, episodes=2, steps=5)
     assert len(found["cells"]) == 1

@@ -1,4 +1,4 @@
-"""What `--help` says, for every command."""
+"""Tests the `--help` texts and the examples of every command."""
 
 import json
 import shlex
@@ -22,7 +22,7 @@ from swarmjax.task.stage_files import load_levels
 from swarmjax.verify import VerifyConfig
 from swarmjax.watch.config import WatchConfig
 
-# The loader of each command and its settings.
+# The loader and the settings class of each command.
 COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.train": (load_run, TrainConfig),
     "swarmjax.evaluate": (partial(load_levels, EvaluateConfig), EvaluateConfig),

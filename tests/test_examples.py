@@ -1,4 +1,4 @@
-"""The examples run as they are written, in a folder of their own."""
+"""Runs the examples as they are written, each in an empty folder."""
 
 import os
 import subprocess

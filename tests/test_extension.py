@@ -1,4 +1,4 @@
-"""Pieces of somebody's own: how they are found, named, told apart and refused."""
+"""Tests extensions: how their pieces are found, named, distinguished by digest, and refused."""
 
 import re
 from pathlib import Path
@@ -119,8 +119,8 @@ def test_pieces_are_handed_over_by_a_word() -> None:
 
 def test_a_word_of_another_program_is_refused() -> None:
     assert refusal(extension.load, "python:0123") == (
-        "extensions is python:0123, which stands for pieces that only the Python program itself "
-        "had: put them into a file and give extensions=FILE."
+        "extensions is python:0123, which stands for pieces that were defined only in a Python "
+        "program: put them into a file and give extensions=FILE."
     )
 
 

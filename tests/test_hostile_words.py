@@ -1,4 +1,4 @@
-"""Words that are meant to do harm are refused by every command in one sentence, at once."""
+"""Tests that every command refuses harmful arguments at once, in one sentence."""
 
 import os
 import time
@@ -42,7 +42,7 @@ NUMBERS = [
 
 
 def _refused(name: str, word: str) -> str:
-    """The sentence with which a command refuses a word, within a second or two."""
+    """Returns the sentence with which a command refuses an argument, after less than 5 s."""
     began = time.monotonic()
     sentence = refusal(COMMANDS[name][0], [*SOUND[name], word])
     assert time.monotonic() - began < 5.0
@@ -88,7 +88,7 @@ def test_a_hostile_suite_is_refused(tmp_path: Path, kind: str) -> None:
 
 
 def _hostile(folder: Path, kind: str) -> Path:
-    """Makes a file that a command should not wait for, and not believe."""
+    """Makes a file that a command must neither wait for nor trust."""
     path = folder / "mine.yaml"
     if kind == "pipe":
         os.mkfifo(path)

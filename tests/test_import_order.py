@@ -1,4 +1,4 @@
-"""Imports go one way, room by room."""
+"""Tests that imports between the rooms, the package's folders, go only one way."""
 
 import ast
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 import swarmjax
 
 ROOT = Path(swarmjax.__file__).parent
-# What every room may import, and what each may import of the others.
+# `SHARED` holds modules that many rooms import. `ROOMS` lists all imports allowed to each room.
 SHARED = {"config", "epuck", "extension", "policy", "policy_file", "atomic_file"}
 SHARED |= {"provenance", "command", "exit_codes", "words"}
 ROOMS = {
@@ -29,12 +29,13 @@ ROOMS = {
     "shell": SHARED,
     "watch": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
 }
-# The engine on the device judges by what trains; the cache of its programs is a run's.
+# `ALSO` lists files that may import more than their room. The judge on the device uses the training
+# code, and the cache of compiled programs belongs to `run`.
 ALSO = {
     "evaluate/engine_mjx.py": {"policy_network", "ppo", "training"},
     "evaluate/trials.py": {"run"},
 }
-# What rooms share imports no room but `config`; policy.py, which people take along, nothing.
+# Shared modules import no room except `config`. policy.py, which users copy, imports nothing.
 ALONE: dict[str, set[str]] = {
     "extension": {"config"},
     "policy": set(),
@@ -52,7 +53,7 @@ FILES = sorted(ROOT.rglob("*.py"))
 
 
 def _imports(source: str) -> set[str]:
-    """What a file imports of swarmjax, wherever it does so, as `sim.fast.discs`."""
+    """Returns what a file imports from swarmjax at any place in it, such as `sim.fast.discs`."""
     names = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -64,7 +65,7 @@ def _imports(source: str) -> set[str]:
 
 
 def _place(path: Path) -> tuple[str, set[str], set[str]]:
-    """A file's room or name, what it imports, and of which rooms."""
+    """Returns a file's room or module name, its imports, and the rooms that they belong to."""
     found = _imports(path.read_text())
     first = path.relative_to(ROOT).parts[0].removesuffix(".py")
     return first, found, {name.partition(".")[0] for name in found} - {first}

@@ -1,4 +1,4 @@
-"""A policy is judged where JAX is not installed."""
+"""Tests that a policy is judged where JAX is not installed."""
 
 import os
 import subprocess
@@ -47,7 +47,7 @@ def _write_policy(path: Path) -> None:
 
 def test_policy_and_evaluate_run_without_jax(tmp_path: Path) -> None:
     _write_policy(tmp_path / "policy.npz")
-    # Packages that cannot be imported, found first; the two workers inherit the path.
+    # Stand-ins that cannot be imported are first on the path, which the two workers inherit.
     absent = tmp_path / "absent"
     absent.mkdir()
     for name in _ABSENT:

@@ -1,4 +1,4 @@
-"""Job scripts, under a stand-in for the scheduler that they call."""
+"""Tests the job scripts with stand-ins for the scheduler's commands."""
 
 import os
 import signal
@@ -27,7 +27,10 @@ def test_a_script_is_sound_bash(script: Path) -> None:
 
 
 def _stand_in(folder: Path, name: str, line: str) -> Path:
-    """Puts a command into a folder that writes its arguments down and ends with a line."""
+    """Writes a stand-in command that records its arguments and then runs `line`.
+
+    Returns the file with the arguments.
+    """
     path = folder / name
     path.write_text(f'#!/bin/sh\necho "$@" > {folder / f"{name}.told"}\n{line}\n')
     path.chmod(0o755)
@@ -35,7 +38,7 @@ def _stand_in(folder: Path, name: str, line: str) -> Path:
 
 
 def _submit(script: str, folder: Path, *words: str, **variables: str) -> subprocess.Popen[bytes]:
-    """Starts a job script as Slurm does, with the commands of a folder."""
+    """Starts a job script as Slurm does, with the commands of a folder first on the path."""
     found = {"PATH": f"{folder}:{os.environ['PATH']}", "SLURM_JOB_ID": "17", **variables}
     command = ["bash", str(ROOT / "launch" / script), *words]
     return subprocess.Popen(command, cwd=ROOT, env=os.environ | found)

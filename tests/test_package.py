@@ -1,4 +1,4 @@
-"""What is built, and what it asks for."""
+"""Tests the built packages and their requirements."""
 
 import ast
 import subprocess
@@ -33,7 +33,7 @@ DIRECT = [
     )
     for text in texts
 ]
-# Modules that are not called as what brings them.
+# Modules whose name differs from the name of their distribution.
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "absl": "absl-py",
@@ -65,7 +65,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
-    """The wheel, built of what the sdist holds."""
+    """Returns the wheel built from the contents of the sdist."""
     tree = tmp_path_factory.mktemp("tree")
     with tarfile.open(sdist) as archive:
         archive.extractall(tree, filter="data")
@@ -80,7 +80,7 @@ def metadata(wheel: zipfile.ZipFile) -> Message:
 
 
 def _files(folder: str) -> set[str]:
-    """The files of a folder, as the wheel names them, without what running them leaves."""
+    """Returns the paths of a folder's files from the repository's root, without `__pycache__`."""
     found = {path for path in (ROOT / folder).rglob("*") if path.is_file()}
     return {str(path.relative_to(ROOT)) for path in found if "__pycache__" not in path.parts}
 
@@ -151,7 +151,7 @@ def test_the_page_names_the_oldest_and_the_newest_version(name: str, called: str
 
 
 def _imported(path: Path) -> set[str]:
-    """The top-level modules that a file imports."""
+    """Returns the top-level modules that a file imports."""
     nodes = list(ast.walk(ast.parse(path.read_text())))
     names = [each.name for node in nodes if isinstance(node, ast.Import) for each in node.names]
     names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
@@ -159,7 +159,10 @@ def _imported(path: Path) -> set[str]:
 
 
 def test_everything_that_is_imported_is_asked_for() -> None:
-    """An import that only a transitive dependency brings breaks when that one drops it."""
+    """Checks that every imported package is a direct dependency.
+
+    An import breaks if only a transitive dependency requires its package and later drops it.
+    """
     imported = set().union(*map(_imported, (ROOT / "swarmjax").rglob("*.py")))
     names = {DISTRIBUTIONS.get(name, name) for name in imported - sys.stdlib_module_names}
     asked = {canonicalize_name(each.name) for each in DIRECT} | {"swarmjax"}
@@ -168,7 +171,7 @@ def test_everything_that_is_imported_is_asked_for() -> None:
 
 @pytest.mark.slow
 def test_an_installed_wheel_trains_and_judges() -> None:
-    """Needs the package index; runs what `.ci/versions.py` does with the newest versions."""
+    """Runs `.ci/versions.py` with the newest versions, which needs the package index."""
     words = [sys.executable, str(ROOT / ".ci" / "versions.py"), "newest"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

@@ -1,4 +1,4 @@
-"""The one file that runs a policy: what it computes, and that it is easy to take along."""
+"""Tests policy.py, the one file that runs a policy: its results, and that it works alone."""
 
 import ast
 import dataclasses
@@ -38,7 +38,7 @@ def _f32(values: Any) -> np.ndarray:
 
 def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
     source = Path(policy.__file__).read_text()
-    assert len(source.splitlines()) <= 270  # three pages of print, memory and hearing included
+    assert len(source.splitlines()) <= 270  # three printed pages
     roots = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -46,7 +46,7 @@ def test_the_file_is_short_and_needs_numpy_alone(tmp_path: Path) -> None:
         elif isinstance(node, ast.ImportFrom):
             roots.add(str(node.module).partition(".")[0])
     assert roots - set(sys.stdlib_module_names) == {"numpy"}
-    # Copied, it runs where this project is not.
+    # A copy of the file runs without this project.
     (tmp_path / "policy.py").write_text(source)
     trained = saved(tmp_path / "policy.npz")
     code = (
@@ -90,21 +90,21 @@ def test_the_digest_is_sha256_over_names_types_shapes_and_bytes() -> None:
 
 
 def _claim(path: Path, size: int) -> None:
-    """Lets the archive say that its first member unpacks to so many bytes."""
+    """Makes the archive claim that its first member unpacks to `size` bytes."""
     content = bytearray(path.read_bytes())
-    entry = content.index(b"PK\x01\x02")  # of the central directory; the size is 24 bytes on
+    entry = content.index(b"PK\x01\x02")  # central directory; the size is 24 bytes further
     content[entry + 24 : entry + 28] = size.to_bytes(4, "little")
     path.write_bytes(content)
 
 
 def _npy(dtype: str, shape: str) -> bytes:
-    """The header of an array, and no array."""
+    """Returns the header of an array without its data."""
     head = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({shape}), }}".ljust(117) + "\n"
     return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
 
 
 def _member(path: Path, content: bytes) -> None:
-    """Adds a member of this content."""
+    """Adds a member with this content."""
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("actor/hidden_9/bias.npy", content)
 
@@ -204,7 +204,8 @@ def test_a_forged_file_takes_no_more_memory_than_four_times_its_size(
         read(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    # Of a small file the interpreter's own objects weigh more: half a megabyte is let pass.
+    # The interpreter's own objects take more memory than a small file, so half a megabyte is
+    # allowed.
     assert peak < max(4 * path.stat().st_size, 2**19)
 
 
@@ -222,7 +223,7 @@ def test_a_large_policy_is_read_with_four_times_its_size_of_memory(
 
 
 def _by_hand(activation: str) -> Policy:
-    """A policy of five observations, two hidden units and two actions."""
+    """Returns a policy with five observations, two hidden units and two actions."""
     hidden = (_f32([[[1, 0], [0, 1], [0, 0], [0, 0], [1, -1]]]), _f32([[0.5, 1]]))
     last = (_f32([[[2, 0], [1, 3]]]), _f32([[0, -1]]))
     return Policy(
@@ -258,14 +259,14 @@ def test_mean_action_by_hand() -> None:
     # Robot 2: normalised (0, 5, 0, 0, -1), hidden (-0.5 -> 0, 5 + 1 + 1).
     seen = _f32([[5, 3, 7, 7, 2], [-1, 2, 7, 7, 20], [1, 5, 7, 7, -0.5]])
     expected = [[13, -1], [19, -1], [7, 20]]
-    # All of these are whole or half numbers, which float32 adds without rounding.
+    # All numbers are whole or half numbers, which float32 adds without rounding.
     np.testing.assert_array_equal(policy.act(_by_hand("relu"), seen), expected)
 
 
 def test_command_by_hand() -> None:
     action = _f32([[[0, 0], [1, -1]], [[-1, 0.5], [3, -7]]])
     expected = [[[0.125, 0], [0.25, -2]], [[0, 1], [0.25, -2]]]
-    # Halves and quarters: float32 has them all.
+    # All numbers are multiples of 1/8, which float32 holds exactly.
     np.testing.assert_array_equal(policy.command(_by_hand("relu"), action), expected)
 
 
@@ -292,7 +293,8 @@ def test_activations_against_float64(tmp_path: Path, activation: str, function: 
     x = np.clip((seen - exact["normalizer/mean"]) / exact["normalizer/std"], -10, 10)
     x = function(x @ exact["actor/hidden_0/kernel"] + exact["actor/hidden_0/bias"])
     expected = x @ exact["actor/mean/kernel"] + exact["actor/mean/bias"]
-    # Sums of SIZE float32 terms of size 30 at most; for ten of them 10 * 30 * 2**-24 = 1.8e-5.
+    # The sums have SIZE float32 terms of at most 30. Ten such terms round by at most
+    # 10 * 30 * 2**-24 = 1.8e-5.
     np.testing.assert_allclose(policy.act(loaded, seen), expected, atol=2e-5)
 
 
@@ -314,7 +316,7 @@ def _logistic(x: np.ndarray) -> np.ndarray:
 
 
 def test_a_memory_by_hand(tmp_path: Path) -> None:
-    """A gated recurrent unit of three numbers, three steps, in float64."""
+    """Compares a gated recurrent unit of three numbers over three steps with float64."""
     arrays = policies.remembering(policies.arrays(hidden=(4,)), 3)
     said = {"memory": {"kind": "gru", "size": 3}}
     loaded = saved(tmp_path / "policy.npz", arrays, **said)
@@ -355,7 +357,7 @@ def test_a_memory_is_handed_in_and_out(tmp_path: Path) -> None:
 
 
 def test_a_history_by_hand(tmp_path: Path) -> None:
-    """Three observations of six control steps, put together by hand for the plain policy."""
+    """Compares a history of three observations over six control steps with one stacked by hand."""
     arrays = policies.stacked(policies.arrays(hidden=(4,)), 3)
     said = {"observation": policies.observed() | {"history": 3}}
     loaded = saved(tmp_path / "policy.npz", arrays, **said)
@@ -411,7 +413,7 @@ def test_a_file_with_a_history_is_of_format_4(tmp_path: Path, history: int, numb
     written = saved(tmp_path / "policy.npz", given, **said)
     assert (written.meta["format"], written.history) == (number, history)
     assert policy.load(tmp_path / "policy.npz").history == history
-    assert saved(tmp_path / "plain.npz").history == 1  # a file that says none
+    assert saved(tmp_path / "plain.npz").history == 1  # a file without a history entry
 
 
 def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None:
@@ -440,7 +442,7 @@ def test_an_action_does_not_depend_on_what_is_computed_beside_it(
 
 
 def _exported(learner: ppo.LearnerState) -> Arrays:
-    """Names a learner's arrays as the file does."""
+    """Returns a learner's arrays by their names in the policy file."""
     actor = jax.tree.map(lambda leaf: np.asarray(leaf)[None], learner.params["actor"])
     layers = {**actor["torso"], "mean": actor["mean"]}
     arrays = {
@@ -459,11 +461,11 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     config = AlgoConfig(hidden_sizes=(64, 64), activation=activation)
     learner = ppo.init(jax.random.key(0), config, SIZE, ACTIONS, updates=1)
     draw = np.random.default_rng(4)
-    # The mean starts with a gain of 0.01, too little to tell networks apart.
+    # The last layer starts with a gain of 0.01, which is too small to tell networks apart.
     params = jax.tree.map(
         lambda leaf: leaf + 0.1 * draw.normal(size=leaf.shape).astype(np.float32), learner.params
     )
-    # Of the bearing, the least one counts.
+    # The bearing's spread of 1e-9 is below the least deviation that the normaliser divides by.
     names = observation.NAMES
     spread = _f32(by_name(names, infrared=0.01, distance=2.0, bearing=1e-9, other=1.0))
     batch = draw.normal(size=(64, SIZE)).astype(np.float32) * spread
@@ -473,7 +475,7 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     # Thirty deviations reach beyond the normaliser's limit of 10.
     seen = draw.normal(size=(40, 3, SIZE)).astype(np.float32) * spread * 30
     expected = np.asarray(ppo.mode(learner, config, jnp.asarray(seen)))
-    assert np.ptp(expected, axis=(0, 1)).min() > 1.0  # the observation matters
-    # Three sums of 64 float32 terms or fewer, in another order: some 64 * 2**-24 = 4e-6 of the
-    # largest term, which is below 10.
+    assert np.ptp(expected, axis=(0, 1)).min() > 1.0  # The observation matters.
+    # Three sums of 64 float32 terms or fewer are added in another order. Each is off by about
+    # 64 * 2**-24 = 4e-6 of its largest term, which is below 10.
     np.testing.assert_allclose(policy.act(loaded, seen), expected, atol=4e-5)

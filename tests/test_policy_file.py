@@ -1,4 +1,4 @@
-"""The policy file: what is written comes back, and whatever is unsound is refused by name."""
+"""Tests the policy file: a written policy reads back, and what is unsound is refused by name."""
 
 import io
 import json
@@ -255,7 +255,7 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
             _part("observation", offset=[10**400] * SIZE),
             rf"meta.observation.offset is \[10+\.\.\.: expected {SIZE} finite numbers",
         ),
-        # As float32, which is what divides, this is 0.
+        # The division is in float32, where 1e-60 is 0.
         (_GOOD, _part("observation", scale=[1e-60] * SIZE), r"meta.observation.scale holds 0"),
         (
             _GOOD,
@@ -271,7 +271,7 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             _part("action", low=[-0.1, -3.14]),
-            r"meta.action.low is \[-0.1, -3.14\].*a speed from 0 up",
+            r"meta.action.low is \[-0.1, -3.14\].*a speed from 0 to high",
         ),
         (_GOOD, _part("observation", limit=3e38), r"meta.observation.limit is 3e\+38: expected at"),
         (
@@ -328,7 +328,7 @@ def test_the_digest_covers_arrays_and_meta(tmp_path: Path) -> None:
     faster = _said(**_part("action", high=[0.25, 3.14]))
     for arrays, said in ((policies.arrays(seed=1), _said()), (_GOOD, faster)):
         forge(path, arrays, said, digest=sound)
-        sentence = r"policy\.npz: digest is \"\w{12}\"\.\.\., but that of the content is \"\w{12}\""
+        sentence = r"policy\.npz: digest is \"\w{12}\"\.\.\., but the content has digest \"\w{12}\""
         with pytest.raises(PolicyError, match=sentence):
             policy_file.read(path)
 
@@ -369,7 +369,7 @@ def _members(content: bytes) -> list[tuple[str, bytes]]:
 
 
 def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
-    """A member whose header says anything."""
+    """Returns a member with any header, sound or not."""
     said = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}"
     header = f"{said}{' ' * spaces}\n".encode()
     return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
@@ -380,7 +380,8 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
     [
         ("actor/mean/bias", _npy("<f4", "2000000000, 2"), "is not a plain array"),
         ("actor/mean/bias", _npy("<f4", "200000000, 2"), "does not have as many values as its"),
-        # NumPy has 64 axes at most, and a product with a 0 in it fits any size.
+        # NumPy has 64 axes at most. A shape with an axis of 0 needs no data, however large its
+        # other axes are.
         ("actor/mean/bias", _npy("<f4", ", ".join("1" * 65), b"\0" * 4), "is not a plain array"),
         (
             "actor/mean/bias",
@@ -390,7 +391,7 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
         (
             "actor/mean/bias",
             _npy("<c16", "0, 999999999, 999999999"),
-            r"has shape \[0, 999999999, 999999999\]: expected no axis of 0",
+            r"has shape \[0, 999999999, 999999999\]: expected no axis of length 0",
         ),
         ("actor/mean/bias", _npy("<f4", "01, 2", b"\0" * 8), "is not a plain array"),
         (
@@ -404,8 +405,8 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
         ("actor/mean/bias", b"", "is not a plain array"),
         ("actor/mean/bias", b"\x93NUMPY\x01\x00\xff\xff", "is not a plain array"),
         ("meta", _npy("<U1", "", b"\xff\xff\xff\xff"), "cannot be read: expected text in Unicode"),
-        ("meta", _npy("<f4", "", b"\0" * 4), r"is float32 \[\]: expected one text"),
-        ("digest", _npy("<U1", "2,", b"\0" * 8), r"is <U1 \[2\]: expected one text"),
+        ("meta", _npy("<f4", "", b"\0" * 4), r"is float32 \[\]: expected a single "),
+        ("digest", _npy("<U1", "2,", b"\0" * 8), r"is <U1 \[2\]: expected a single "),
     ],
 )
 def test_read_refuses_a_forged_member(
@@ -429,9 +430,9 @@ def test_read_refuses_members_that_no_policy_has(tmp_path: Path) -> None:
             policy_file.read(path)
     with pytest.warns(UserWarning, match="Duplicate"):
         path.write_bytes(_zip([*members, members[0]]))
-    with pytest.raises(PolicyError, match=r'npy" is there more than once'):
+    with pytest.raises(PolicyError, match=r'npy" appears more than once'):
         policy_file.read(path)
-    # What is not stored as it is could unpack to anything.
+    # A compressed member could unpack to any size.
     path.write_bytes(_zip(members, zipfile.ZIP_DEFLATED))
     with pytest.raises(PolicyError, match=r'npy" is compressed or encrypted'):
         policy_file.read(path)
@@ -445,7 +446,7 @@ def test_read_refuses_members_that_overlap(tmp_path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         sizes = [member.file_size for member in archive.infolist()]
         start = archive.start_dir
-    # Ten entries of the directory say that they have the bytes of all the file.
+    # Every entry of the archive's directory claims to have as many bytes as the whole file.
     directory = bytearray(content[start:])
     at = 0
     for name in names:
@@ -526,14 +527,14 @@ def _flipped(content: bytes, draw: np.random.Generator, _: Path) -> bytes:
 
 
 def _overwritten(content: bytes, draw: np.random.Generator, _: Path) -> bytes:
-    """A block of noise, as a bad sector leaves it."""
+    """Overwrites a block with noise, as a bad sector does."""
     size = int(draw.integers(1, 600))
     at = int(draw.integers(len(content)))
     return content[:at] + draw.bytes(size) + content[at + size :]
 
 
 def _spliced(content: bytes, draw: np.random.Generator, _: Path) -> bytes:
-    """Bytes taken out or doubled."""
+    """Removes a range of bytes or doubles it."""
     start, end = sorted(int(at) for at in draw.integers(len(content) + 1, size=2))
     return (
         content[:start] + content[end:] if draw.random() < 0.5 else content[:end] + content[start:]
@@ -541,7 +542,7 @@ def _spliced(content: bytes, draw: np.random.Generator, _: Path) -> bytes:
 
 
 def _pickled(content: bytes, draw: np.random.Generator, mark: Path) -> bytes:
-    """A member that would run code if it were unpickled, or a bare pickle."""
+    """Replaces a member, or the whole file, by a pickle that would run code when loaded."""
     if draw.random() < 0.2:
         return pickle.dumps(_Trap(mark))
     members = dict(_members(content))
@@ -553,7 +554,7 @@ def _pickled(content: bytes, draw: np.random.Generator, mark: Path) -> bytes:
 
 
 def _foreign(content: bytes, draw: np.random.Generator, _: Path) -> bytes:
-    """A sound archive whose digest is right, and one thing in it wrong."""
+    """Makes one thing in a sound archive wrong and stores the digest of the result."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = dict(archive)
     meta = json.loads(str(arrays.pop("meta")))
@@ -614,14 +615,15 @@ def test_of_1400_damaged_files_each_is_refused_or_reads_as_before(tmp_path: Path
                 continue
             if read is policy_file.read:
                 same[name] += 1
-                # The archive's times, attributes and the like are no content.
+                # Damage to the archive's times or attributes does not change the content.
                 assert (found.meta, found.digest) == (whole.meta, whole.digest)
                 for array, expected in zip(_arrays(found), _arrays(whole), strict=True):
                     np.testing.assert_array_equal(array, expected)
     assert not mark.exists()  # nothing was unpickled
     never = {"_truncated", "_pickled", "_foreign", "_repeated"}
     assert all(same[name] == 0 for name in never)
-    # Most bytes are covered by a checksum or name something; a few, of times say, are neither.
+    # Most bytes are covered by a checksum or belong to a name. A few bytes, such as those of times,
+    # are neither.
     assert 0 < same["_flipped"] < 0.2 * _EACH
 
 

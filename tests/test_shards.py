@@ -1,6 +1,6 @@
-"""Statistics of arenas that are spread over devices are those of all arenas.
+"""Tests that statistics of arenas spread over devices equal those of all arenas on one device.
 
-`jax.vmap` with the axis of the mesh stands for the devices.
+`jax.vmap` with the mesh's axis name stands in for the devices.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ def _on_two(function: Callable[..., Any], *halves: np.ndarray) -> Any:
 
 @pytest.fixture
 def samples() -> tuple[np.ndarray, np.ndarray]:
-    """Values whose halves differ much, and which of them are valid."""
+    """Returns values whose halves differ strongly, and which of the values are valid."""
     values = np.concatenate([np.linspace(0.0, 1.0, 8), np.linspace(50.0, 90.0, 8)])
     valid = np.arange(16) % 5 > 0
     return values.astype(np.float32), valid

@@ -1,4 +1,4 @@
-"""The command that draws suites: what it chooses, writes and refuses."""
+"""Tests the command that draws suites: what it chooses, writes and refuses."""
 
 import sys
 from pathlib import Path
@@ -75,7 +75,7 @@ def test_step_limits_are_listed(
     file.write_text(f"{TEXT}    steps: 2345\n")
     assert _command(monkeypatch, f"suite={file}", "write=true") == 0
     head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
-    # A side, such as 0.6 m, is two words in a row.
+    # A side, such as 0.6 m, is two words in the printed row.
     column = head.index("steps") + 1
     assert [row[column] for row in rows] == ["-", "2345"]
 
@@ -104,7 +104,8 @@ def test_the_levels_that_policies_fail_most_are_chosen() -> None:
     cell = Cell("x", stage, "box", None, 1_000_000, np.array([10, 11, 12, 13, 14]), levels)
     tables = {name: np.array(table) for name, table in found.items()}
     trial = Trial(cell, np.zeros((5, 1)), tables, np.zeros((2, 5, 1)))
-    # All others reach half their targets in the mean: most contacts, then longest, then first.
+    # All levels but the first reach half of their targets on average. These levels are ordered by
+    # most contacts, then by longest time, then by lowest number.
     assert suite.choose(trial, 1).tolist() == [12]
     assert suite.choose(trial, 2).tolist() == [12, 13]
     assert suite.choose(trial, 3).tolist() == [11, 12, 13]

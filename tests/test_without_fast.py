@@ -1,4 +1,4 @@
-"""Everything works without the faster ways of `sim/fast/` and `ppo/fast/`, slower."""
+"""Tests that training works, more slowly, without `sim/fast/` and `ppo/fast/`."""
 
 import json
 import subprocess

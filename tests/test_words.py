@@ -1,4 +1,4 @@
-"""Numbers in the lines that commands print."""
+"""Tests how commands print numbers."""
 
 import pytest
 

@@ -66,7 +66,7 @@ class SwarmVectorEnv(_vector.VectorEnv):
         if seed is not None and not isinstance(seed, int | np.integer):
             raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
         if "reset_mask" in (options or {}):
-            raise errors.Error("options has reset_mask: arenas reset themselves, all or none.")
+            raise errors.Error("options has reset_mask, but reset starts all arenas: remove it.")
         super().reset(seed=None if seed is None else int(seed))
         return self._session.reset(int(self.np_random.integers(2**31))), {}
 

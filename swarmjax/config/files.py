@@ -302,7 +302,9 @@ def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
     for key, word in words.items():
         _check_word(key, word, is_text=key in texts)
     if sum(word.count("${") for word in words.values()) > _MOST_REFERENCES:
-        raise ConfigError(f"the words use ${{...}} too often: give at most {_MOST_REFERENCES}.")
+        raise ConfigError(
+            f"the arguments use ${{...}} too often: use it at most {_MOST_REFERENCES} times."
+        )
     return {key: _quote(word) if key in texts else word for key, word in words.items()}
 
 
@@ -313,7 +315,8 @@ def _check_word(key: str, word: str, *, is_text: bool) -> None:
         section.check_text(key, value)
     elif len(value) > _MOST_VALUE:
         raise ConfigError(
-            f"{key} is {show(value)}, of {len(value)} letters: give at most {_MOST_VALUE}."
+            f"{key} is {show(value)}, which has {len(value)} characters: give at most "
+            f"{_MOST_VALUE}."
         )
     elif _depth(value) > _MOST_DEPTH:
         raise ConfigError(f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep.")

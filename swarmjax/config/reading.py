@@ -230,7 +230,7 @@ def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
 
 def _check_scalar(value: str, where: str) -> None:
     if len(value) > _MOST_SCALAR:
-        most = f"a value has more than {_MOST_SCALAR} letters"
+        most = f"a value has more than {_MOST_SCALAR} characters"
         raise ConfigError(f"{where} cannot be read: {most}.")
 
 

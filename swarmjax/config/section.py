@@ -54,7 +54,7 @@ class Bounds:
         """
         why = f"; {self.reason}" if self.reason and number > self.high else ""
         if number != 0 and self.low <= number <= self.high and not _fits(number):
-            why = f"; float32 holds 0 and sizes of {_SMALLEST:g} to {_LARGEST:g}"
+            why = f"; float32 holds 0 and magnitudes of {_SMALLEST:g} to {_LARGEST:g}"
         return ConfigError(f"{key} is {show(value)}: give {self}{why}.")
 
     def __str__(self) -> str:

@@ -144,7 +144,7 @@ class CurriculumConfig(Section):
         default="mixed",
         metadata=about(
             "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
-            "on all stages, most on those where the most is learned"
+            "on all stages, more of them on stages with a higher score"
         ),
     )
     success: Literal["targets", "all"] = field(
@@ -157,7 +157,8 @@ class CurriculumConfig(Section):
     threshold: float | None = field(
         default=None,
         metadata=about(
-            "success that promotes; null: 0.8 [sequential, mixed, adaptive with prerequisites]",
+            "success at which training moves on to the next stage; null: 0.8 [sequential, mixed, "
+            "adaptive with prerequisites]",
             0.0,
             1.0,
         ),
@@ -224,8 +225,8 @@ class CurriculumConfig(Section):
     normalizer: Literal["keep", "relearn"] = field(
         default="keep",
         metadata=about(
-            "observation normaliser at a promotion; relearn: from the next batch on, without the "
-            "past [sequential, mixed]"
+            "observation normaliser at a promotion; relearn: forget earlier batches and estimate "
+            "it again from the next ones [sequential, mixed]"
         ),
     )
     exploration: Literal["keep", "reset"] = field(

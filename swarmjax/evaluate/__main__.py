@@ -58,7 +58,9 @@ def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
     """
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
     if done:
-        sys.stdout.write(f"swarmjax.evaluate: {done} of {cells} cells were judged before, {keep}\n")
+        sys.stdout.write(
+            f"swarmjax.evaluate: {done} of {cells} cells were judged before, in {keep}\n"
+        )
     sys.stdout.flush()
 
 
@@ -68,7 +70,7 @@ def _left(keep: Path | None) -> str:
     if not done:
         return "nothing was written"
     are = "1 cell is" if done == 1 else f"{done} cells are"
-    return f"{are} in {keep}, and the same command goes on"
+    return f"{are} in {keep}, and the same command continues with the rest"
 
 
 def _check_out(path: Path) -> None:

@@ -61,7 +61,7 @@ class EvaluateConfig(Section):
     steps: int | None = field(
         default=None,
         metadata=about(
-            f"control steps of an episode; null: the suite cell's, else {STEPS} (Table 1)",
+            f"control steps of an episode; null: as in the suite's cell, else {STEPS} (Table 1)",
             1,
             MOST_STEPS,
         ),

@@ -60,7 +60,9 @@ def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray
     if at.ndim != 1 or len(at) < 2 or not (np.diff(at) > 0).all():
         raise ValueError(f"steps of shape {at.shape} must be two or more numbers that rise.")
     if curves.shape[-1:] != at.shape:
-        raise ValueError(f"values has shape {curves.shape}: give [..., {len(at)}], as steps has.")
+        raise ValueError(
+            f"values has shape {curves.shape}: give [..., {len(at)}], one value for each step."
+        )
     for name, numbers in (("steps", at), ("values", curves)):
         if np.isinf(numbers).any():
             raise ValueError(f"{name} holds inf: the points of a curve are finite.")

@@ -150,8 +150,8 @@ def _sides(settings: EvaluateConfig) -> list[list[str]]:
     first, second = map(len, sides)
     if first != second:
         raise ConfigError(
-            f"compare is {show(settings.compare)}, which is {first} against {second}: give as many "
-            "policies on both sides, with the same seeds in the same order."
+            f"compare is {show(settings.compare)}, with {first} and {second} policies: give the "
+            "same number on both sides, with the same seeds in the same order."
         )
     return sides
 

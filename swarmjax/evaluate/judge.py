@@ -207,7 +207,7 @@ def check_policy(
         found = layout.get(key)
         if found != expected:
             raise PolicyError(
-                f"{path} was trained on other observations than this robot makes: its "
+                f"{path} was trained on observations that differ from this robot's: its "
                 f"meta.observation.{key} is {_list(found)}, expected {_list(expected)}."
             )
     learners = len(trained.log_std)

@@ -238,11 +238,11 @@ def check(level: Level, moves: list[Move], hull_radius: float, target_radius: fl
         if np.abs(path[0] - place[robot]).max() > 0.0:
             return f"robot {robot} jumps"
         if np.abs(points).max() > inside:
-            return f"robot {robot} meets a wall of the arena"
+            return f"robot {robot} collides with a wall of the arena"
         if any((_box_distance(points, box) < hull_radius).any() for box in boxes):
-            return f"robot {robot} meets a wall"
+            return f"robot {robot} collides with a wall"
         if apart.size and apart.min() < 2.0 * hull_radius:
-            return f"robot {robot} meets another"
+            return f"robot {robot} collides with another robot"
         place[robot] = path[-1]
     late = np.linalg.norm(place - level.target, axis=-1) > target_radius
     return (

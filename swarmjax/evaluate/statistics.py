@@ -135,7 +135,7 @@ def cvar(
       ValueError: share is out of range, or x is empty or holds nan or -inf.
     """
     if not 0 < share <= 1:
-        raise ValueError(f"share is {share}: give more than 0, to 1.")
+        raise ValueError(f"share is {share}: give more than 0, at most 1.")
     values = _flat(x, axis)
     count = values.shape[-1]
     # Rounded first: 0.07 * 100 is 7.000000000000001, but means seven values.
@@ -272,7 +272,10 @@ def probability_of_improvement(
         raise ValueError(f"draw is '{draw}': give runs_per_task, runs, tasks or runs_and_tasks.")
     ours, theirs = checked_table("a", a, draw), checked_table("b", b, draw)
     if ours.shape[1] != theirs.shape[1]:
-        raise ValueError(f"a has {ours.shape[1]} tasks and b has {theirs.shape[1]}: give the same.")
+        raise ValueError(
+            f"a has {ours.shape[1]} tasks and b has {theirs.shape[1]}: give the same number of "
+            "tasks."
+        )
     _check_resampling(confidence, resamples)
     _check_strata(strata, ours.shape[1])
     wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
@@ -295,7 +298,7 @@ def checked(name: str, x: ArrayLike) -> np.ndarray:
     if np.isnan(values).any():
         raise ValueError(f"{name} holds nan: {np.isnan(values).sum()} of {values.size} values.")
     if (values == -np.inf).any():
-        raise ValueError(f"{name} holds -inf: only inf has a meaning here, never reached.")
+        raise ValueError(f"{name} holds -inf: give finite values, or inf for never reached.")
     return values
 
 
@@ -319,7 +322,7 @@ def checked_table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     for what, how, count in zip(("runs", "tasks"), _DRAWS[draw], values.shape, strict=True):
         if how != "kept" and count < LEAST_DRAWN:
             raise ValueError(
-                f"{name} has {count} {what}: an interval over {what} takes {LEAST_DRAWN} or more."
+                f"{name} has {count} {what}: an interval over {what} needs {LEAST_DRAWN} or more."
             )
     return values
 
@@ -329,7 +332,10 @@ def _check_resampling(confidence: float, resamples: int) -> None:
         raise ValueError(f"confidence is {confidence}: give more than 0 and less than 1.")
     # The small number allows for rounding: 20 * (1 - 0.9) is 1.9999999999999996.
     if resamples * (1 - confidence) < 2 - 1e-9:
-        raise ValueError(f"resamples is {resamples}: too few for confidence {confidence}.")
+        raise ValueError(
+            f"resamples is {resamples}: too few for confidence {confidence}. Give more resamples "
+            "or a lower confidence."
+        )
 
 
 def _blocks(resamples: int, cells: int) -> Iterator[int]:
@@ -401,7 +407,9 @@ def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
     """Computes statistics [...] of x [..., runs, tasks]."""
     found = np.asarray(statistic(x, axis=_LAST_TWO))
     if found.shape != x.shape[:-2]:
-        raise ValueError(f"statistic of {x.shape} has shape {found.shape}: give {x.shape[:-2]}.")
+        raise ValueError(
+            f"statistic of values of shape {x.shape} has shape {found.shape}: give {x.shape[:-2]}."
+        )
     if np.isnan(found).any():
         raise ValueError("statistic gives nan for values without nan.")
     return found

@@ -28,14 +28,14 @@ class CellConfig(Section):
     seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
     episodes: tuple[int, ...] = field(
         default=(),
-        metadata=about("numbers of the levels; none: 0 to levels - 1", 0, MAX_COUNT),
+        metadata=about("numbers of the levels; empty: 0 to levels - 1", 0, MAX_COUNT),
     )
     realism: Literal["ideal", "webots", "real"] | None = field(
         default=None, metadata=about("preset; null: the command's")
     )
     steps: int | None = field(
         default=None,
-        metadata=about("control steps of an episode; null: the command's", 1, MOST_STEPS),
+        metadata=about("control steps of an episode; null: as set for the command", 1, MOST_STEPS),
     )
     hull_friction: float | None = field(
         default=None,
@@ -51,7 +51,8 @@ class CellConfig(Section):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
         if self.episodes and len(self.episodes) != self.levels:
             raise ConfigError(
-                f"levels is {self.levels}, but episodes are {len(self.episodes)}: give as many."
+                f"levels is {self.levels}, but episodes lists {len(self.episodes)}: give as many "
+                "episodes as levels."
             )
         if len(set(self.episodes)) != len(self.episodes):
             raise ConfigError("episodes holds a number twice: give each once.")
@@ -71,7 +72,7 @@ class CellConfig(Section):
 class SuiteFileConfig(Section):
     """A suite: levels for judging policies, never for training."""
 
-    name: str = field(metadata=about("of the suite, equal to its file's"))
+    name: str = field(metadata=about("name of the suite, equal to the name of its file"))
     cells: tuple[CellConfig, ...]
 
     def _check(self) -> None:

@@ -146,7 +146,8 @@ def _read_trial(path: Path, cell: Cell) -> Trial:
         shortest, arrival = arrays.pop("shortest"), arrays.pop("arrival")
     except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
         raise ConfigError(
-            f"{path} cannot be read: {str(error).rstrip('.')}. Remove it; its cell is judged again."
+            f"{path} cannot be read: {str(error).rstrip('.')}. Remove the file, and its cell will "
+            "be judged again."
         ) from None
     found = {name.removeprefix("found/"): table for name, table in arrays.items()}
     return Trial(cell, shortest, found, arrival)

@@ -175,7 +175,7 @@ def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
             if given != held:
                 raise ConfigError(
                     f"{key} is {given}, but {path} was trained with {held}: leave {key} out, since "
-                    "each policy is judged with its own."
+                    "each policy is judged with the value that it was trained with."
                 )
 
 

@@ -72,7 +72,9 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
     """Returns the path of a single policy, whether or not it already exists."""
     out = Path(settings.out) if settings.out else folder / _default(settings)
     if out.name in ("", ".."):
-        raise ConfigError(f"out is {out}, which has no name of its own: give another name.")
+        raise ConfigError(
+            f"out is {out}, which does not end with a name: add the name of a file or folder."
+        )
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
         raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
@@ -98,8 +100,8 @@ def _check_controller(out: Path) -> None:
         )
     if out.name in _IMPORTED:
         raise ConfigError(
-            f"out is {out}, whose name is also the controller's, but it imports a module of that "
-            "name: give another, as in swarmjax_epuck."
+            f"out is {out}, whose name is also the controller's, but the controller imports a "
+            "module of that name: give another name, as in swarmjax_epuck."
         )
 
 

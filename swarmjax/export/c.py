@@ -254,7 +254,7 @@ def _code(trained: Policy) -> dict[str, str]:
         "scale": _values(layout["scale"]),
         "limit": limit,
         "arrays": "\n".join(_arrays(trained)),
-        "tanh": ", and that not for relu" if trained.memory is None else "",
+        "tanh": ", and nothing if the activation is relu" if trained.memory is None else "",
         "activation": _ACTIVATIONS[trained.meta["activation"]],
         "history": _HISTORY_CALL.replace("LIMIT", limit) if trained.history > 1 else "",
         "layers": "\n".join(_calls(sizes, _recalled(trained))),

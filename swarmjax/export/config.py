@@ -13,8 +13,12 @@ class ExportConfig(Section):
 
     command: ClassVar[str] = "export"
 
-    run: str | None = field(default=None, metadata=about("run directory; this or policy"))
-    policy: str | None = field(default=None, metadata=about("path of a policy.npz; this or run"))
+    run: str | None = field(
+        default=None, metadata=about("run directory; give either run or policy")
+    )
+    policy: str | None = field(
+        default=None, metadata=about("path of a policy.npz; give either run or policy")
+    )
     format: Literal["npz", "onnx", "c", "webots"] = field(
         default="npz", metadata=about("form of the export: an npz or onnx file, or a folder")
     )
@@ -27,7 +31,9 @@ class ExportConfig(Section):
     )
     out: str | None = field(
         default=None,
-        metadata=about("file or folder; null: in run or beside policy, by format and step"),
+        metadata=about(
+            "file or folder to write; null: in run or beside policy, named by format and step"
+        ),
     )
     extensions: str | None = field(
         default=None,
@@ -54,4 +60,4 @@ class ExportConfig(Section):
                 f"sensors is {self.sensors}, but format is {self.format}: give format=webots."
             )
         if self.out is None and self.run is None and self.format == "npz":
-            raise ConfigError("out is null, but policy is given already: give out=FILE.")
+            raise ConfigError("out is null, but policy is already an npz file: give out=FILE.")

@@ -86,8 +86,8 @@ def check_folder(path: Path) -> None:
         raise _unwritable(path, error) from None
     if strange:
         raise ConfigError(
-            f"out is {path}, where {strange} is not as an export wrote it: give another folder, "
-            "or move it away."
+            f"out is {path}, where {strange} is not from an export or was changed since: give "
+            f"another folder, or move {strange} away."
         )
 
 

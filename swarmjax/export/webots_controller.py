@@ -247,7 +247,7 @@ def control_period(trained: Policy, basic_step: float) -> int:
     if steps < 1 or abs(steps * basic_step - period) > 1e-6 * period:
         raise ValueError(
             f"basicTimeStep is {basic_step:g} ms: give {period:g} ms, the control step of the "
-            "policy, or a whole part of it."
+            "policy, or a divisor of it."
         )
     return round(period)
 

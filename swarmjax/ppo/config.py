@@ -37,7 +37,7 @@ class AlgoConfig(Section):
 
     removed: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
-        "give a fixed price in the reward instead.",
+        "give a negative task.reward.robot_contact instead.",
     )
     renamed: ClassVar[Mapping[str, str]] = {
         "rollout": "rollout_length",
@@ -73,7 +73,7 @@ class AlgoConfig(Section):
     )
     memory: Literal["none", "gru"] = field(
         default="none",
-        metadata=about("memory of the robots; gru: a gated recurrent unit behind the layers"),
+        metadata=about("memory of the robots; gru: a gated recurrent unit after the layers"),
     )
     memory_size: int | None = field(
         default=None,
@@ -95,7 +95,9 @@ class AlgoConfig(Section):
     )
     mean_activation: Literal["linear", "tanh"] = field(
         default="linear",
-        metadata=about("for the mean action; tanh: within the commands' range"),
+        metadata=about(
+            "activation of the mean action; tanh: keeps the action within the range of the commands"
+        ),
     )
     initialization: Literal["orthogonal", "uniform"] = field(
         default="orthogonal",
@@ -105,7 +107,9 @@ class AlgoConfig(Section):
     )
     normalize_observations: bool = field(
         default=True,
-        metadata=about("scale by running mean and deviation; false: raw, clipped to +-10"),
+        metadata=about(
+            "scale observations by their running mean and deviation; false: raw, clipped to +-10"
+        ),
     )
     rollout_length: int = field(
         default=32, metadata=about("control steps per update", 1, MAX_COUNT)
@@ -114,11 +118,11 @@ class AlgoConfig(Section):
         default=1, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
     )
     num_minibatches: int = field(
-        default=8, metadata=about("gradient steps per pass; divides arenas", 1, MAX_COUNT)
+        default=8, metadata=about("gradient steps per pass; must divide arenas", 1, MAX_COUNT)
     )
     discount: float = field(
         default=0.998,
-        metadata=about("each control step: 'discount factor (gamma)'", 0.0, 1.0),
+        metadata=about("discount per control step: 'discount factor (gamma)'", 0.0, 1.0),
     )
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
@@ -137,8 +141,8 @@ class AlgoConfig(Section):
     time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
         default=None,
         metadata=about(
-            "a return at the step limit; bootstrap: adds the critic's value [gae], terminal: ends, "
-            "leak: goes on into the next episode [monte_carlo]; null: bootstrap or terminal"
+            "the return at the step limit; bootstrap: adds the critic's value [gae]; terminal: "
+            "ends; leak: goes on into the next episode [monte_carlo]; null: bootstrap or terminal"
         ),
     )
     clip_epsilon: float = field(
@@ -185,8 +189,8 @@ class AlgoConfig(Section):
         default="auto",
         metadata=about(
             "how to compute gradients; fused: GPU kernels, with minibatches of tiles of valid "
-            "samples; auto: fused on an NVIDIA GPU that fits the layers; with a memory, autodiff "
-            "without the rollouts of absent robots"
+            "samples; auto: fused on an NVIDIA GPU if the kernels support the layers; with a "
+            "memory, autodiff that leaves out the rollouts of absent robots"
         ),
     )
     exploration: Literal["learned", "scheduled"] = field(
@@ -200,15 +204,15 @@ class AlgoConfig(Section):
     std_decrement: float | None = field(
         default=None,
         metadata=about(
-            "decrease at each step down: 'the decay rate of std of action distribution'; null: "
-            "0.05 [exploration=scheduled]",
+            "decrease of the deviation at a time: 'the decay rate of std of action distribution'; "
+            "null: 0.05 [exploration=scheduled]",
             above=0.0,
         ),
     )
     std_interval: int | None = field(
         default=None,
         metadata=about(
-            "control steps of all arenas between steps down: 'decay frequency of std of action "
+            "control steps of all arenas between decreases: 'decay frequency of std of action "
             "distribution'; null: 250000 [exploration=scheduled]",
             1,
             MAX_COUNT,
@@ -245,8 +249,9 @@ class AlgoConfig(Section):
             )
         if self.mean_activation == "tanh" and self.activation != "tanh":
             raise ConfigError(
-                f"mean_activation is tanh, but activation is {self.activation}, and a policy's "
-                "file has one for all layers: give activation=tanh or mean_activation=linear."
+                f"mean_activation is tanh, but activation is {self.activation}, and a policy file "
+                "stores one activation for all layers: give activation=tanh or "
+                "mean_activation=linear."
             )
 
     def _check_memory(self) -> None:
@@ -270,8 +275,8 @@ class AlgoConfig(Section):
                 )
         if self.network not in (None, "mlp"):
             raise ConfigError(
-                f"network is {show(self.network)}, but memory is {self.memory}, which goes with "
-                "hidden layers alone: give network=mlp or memory=none."
+                f"network is {show(self.network)}, but memory is {self.memory}, which works only "
+                "with hidden layers: give network=mlp or memory=none."
             )
 
     def _check_critic(self) -> None:

@@ -130,14 +130,14 @@ def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> Confi
     narrow = replace(config, hidden_sizes=(16, 16))
     if config.torso is None and not _fits(narrow, observation_size, action_size):
         return ConfigError(
-            f"algo.update_backend is fused, but {observation_size} numbers are observed, which do "
-            "not fit the chip: give a smaller task.history, fewer task.observations, or "
+            f"algo.update_backend is fused, but {observation_size} numbers are observed, more than "
+            "the kernels support: give a smaller task.history, fewer task.observations, or "
             "algo.update_backend=auto."
         )
     return ConfigError(
         f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
-        "which does not fit "
-        "the chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
+        "which the kernels do not support: give two layers of 16, 32 or 64, or "
+        "algo.update_backend=auto."
     )
 
 

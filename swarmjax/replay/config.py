@@ -26,7 +26,7 @@ class ReplayConfig(Section):
     stage: StageConfig
     suite: str | None = field(
         default=None,
-        metadata=about("instead of a stage: a name of configs/suites/, or a file .yaml or .npz"),
+        metadata=about("instead of a stage: a name in configs/suites/, or a .yaml or .npz file"),
     )
     cell: str | None = field(
         default=None, metadata=about("cell of the suite; null: all cells, only with worst")

@@ -80,7 +80,7 @@ def fold(name: str, table: np.ndarray) -> tuple[bytes, int]:
     if not largest < MOST:
         raise ConfigError(
             f"{name} is too large for a replay: it reaches {largest:.3g} of its quanta, "
-            f"and {MOST:.3g} are the limit."
+            f"and a replay can store less than {MOST:.3g}."
         )
     steps = np.diff(table.astype(np.int64), axis=0, prepend=0).T.ravel()
     folded = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u4")

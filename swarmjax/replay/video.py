@@ -60,8 +60,8 @@ def check() -> None:
             mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
     except Exception:  # each platform's library raises its own errors
         raise ConfigError(
-            f"video needs OpenGL, which MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not find "
-            "here: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
+            f"video needs OpenGL, but MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not work on "
+            "this machine: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
         ) from None
 
 

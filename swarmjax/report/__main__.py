@@ -89,7 +89,7 @@ def main(arguments: Sequence[str]) -> int:
         sys.stdout.write(f"{table.text(lines)}\n")
         if settings.out:
             written = write_table(lines, Path(settings.out), made_by)
-            sys.stdout.write(f"{written[-1]}: the same as a page.\n")
+            sys.stdout.write(f"{written[-1]}: the same table as a page.\n")
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"

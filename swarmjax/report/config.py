@@ -17,7 +17,7 @@ class ReportConfig(Section):
         default=None,
         metadata=about(
             "instead of run: run directories, folders of runs (an array, a sweep) and patterns, "
-            "separated by commas; makes a table with one line per settings"
+            "separated by commas; makes a table with one line for all runs of the same settings"
         ),
     )
     out: str | None = field(

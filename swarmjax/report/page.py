@@ -24,7 +24,7 @@ _CAPTIONS = {
     "seed has a value.",
     "curves": "Learning curves over updates. Return and contacts are sums over an episode, and "
     "means over the robots of the episodes that ended in the update. Short episodes end first, so "
-    "the first values mean little. Entropy is that of the policy's actions, in nats.",
+    "the first values mean little. The entropy of the policy's actions is in nats.",
     "levels": "The curriculum over levels: how many levels of each stage are kept, how many "
     "episodes began on one of them, and the success and score of these levels.",
     "practised": "The levels of each stage with the highest scores, from the newest checkpoint of "

@@ -100,7 +100,9 @@ def find(text: str) -> list[Path]:
         named = sorted(glob(part)) if set(part) & set("*?[") else [part]
         within = [run for path in named for run in _within(Path(path), part)]
         if not part or not within:
-            raise ConfigError(f"runs is {show(text)}, but {show(part)} neither is nor holds a run.")
+            raise ConfigError(
+                f"runs is {show(text)}, but {show(part)} names neither a run nor a folder of runs."
+            )
         found += within
     twice = [str(run) for run in found if found.count(run) > 1]
     if twice:
@@ -170,8 +172,8 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
         for seed in history.seeds.tolist():
             if seed in owner:
                 raise ConfigError(
-                    f"seed {seed} is in {owner[seed]} and in {run}, of the same settings: give one "
-                    "of them."
+                    f"seed {seed} is in {owner[seed]} and in {run}, which have the same settings: "
+                    "give one of them."
                 )
             owner[seed] = run
     histories = [history for _, history in group]
@@ -229,8 +231,8 @@ def note(lines: Sequence[TableLine]) -> str:
     """Explains the success and interval columns."""
     measures = " or ".join(sorted({line.measure for line in lines}))
     return (
-        f"Success: {measures} on the last stage, of its newest whole cohort; mean over seeds and "
-        f"95 % bootstrap interval, which takes {LEAST_DRAWN} seeds."
+        f"Success: {measures} on the last stage, in its newest whole cohort; mean over seeds and "
+        f"95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
     )
 
 

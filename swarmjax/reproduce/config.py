@@ -51,7 +51,7 @@ class ReproduceConfig(Section):
         default=250_000, metadata=about("control steps per seed in the 1.5 m arena", 1, MAX_COUNT)
     )
     arms: tuple[Arm, ...] = field(
-        default=ARMS, metadata=about("which runs; *_expanded continues the arm of that name")
+        default=ARMS, metadata=about("arms to train; NAME_expanded continues arm NAME")
     )
     rollout_length: int = field(
         default=6000, metadata=about("control steps per update of the paper's PPO", 1, MAX_COUNT)
@@ -72,7 +72,7 @@ class ReproduceConfig(Section):
         default="paper", metadata=about("speed range: as printed, or of the hardware")
     )
     impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("what steps the physics, as in sim.impl")
+        default="auto", metadata=about("physics implementation, as in sim.impl")
     )
     device: Literal["auto", "cpu", "gpu"] = field(
         default="auto", metadata=about("device for training; auto: a GPU if there is one")
@@ -103,7 +103,7 @@ class ReproduceConfig(Section):
             if getattr(self, key) < self.rollout_length:
                 raise ConfigError(
                     f"{key} is {getattr(self, key)}, which ends before the first update: give at "
-                    f"least {self.rollout_length}, the control steps of one."
+                    f"least {self.rollout_length}, the control steps of one update."
                 )
         if not self.arms:
             raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")

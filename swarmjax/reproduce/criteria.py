@@ -83,7 +83,7 @@ def crowded(values: np.ndarray) -> tuple[bool | None, str]:
     text = f"{NUMBER.difference(found)} steps"
     if found.high <= _ROUNDING:
         return False, text
-    return None, f"{text}, which crowding would bring about, and other things too"
+    return None, f"{text}, which crowding would cause, but other things would too"
 
 
 def _mean(values: np.ndarray) -> Interval[float]:

@@ -83,7 +83,7 @@ def _open(directory: Path) -> None:
     found = directory.stat()
     mine = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
     if not mine or (os.name == "posix" and found.st_mode & 0o022):
-        raise OSError(f"others can write {directory}, and could run code through it")
+        raise OSError(f"other users can write to {directory} and could run code through it")
 
 
 def _entries(directory: Path) -> list[tuple[str, Path]]:

@@ -275,8 +275,8 @@ def cut(path: Path, length: int) -> None:
         file.seek(max(0, length - 1))
         if found < length or (length and file.read(1) != b"\n"):
             raise CheckpointError(
-                f"{path} has {found} bytes, and not the {length} with whole lines that its "
-                "checkpoint counts: put the file back, or delete it to go on without its rows."
+                f"{path} has {found} bytes, but its checkpoint counts {length} bytes of whole "
+                "lines: put the file back, or delete it to go on without its rows."
             )
         file.truncate(length)
 

@@ -113,8 +113,8 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
         math.ceil(settings.task.step_limit / settings.algo.rollout_length), "update"
     )
     return (
-        f"targets reached: not measured yet, since no whole cohort ended: its episodes begin "
-        f"within one step limit ({updates}) and end within another"
+        f"targets reached: not measured yet, since no whole cohort ended: the episodes of a cohort "
+        f"begin within one step limit ({updates}) and end within the next"
     )
 
 

@@ -90,7 +90,7 @@ def _values(key: str, text: str) -> list[str]:
 
     files.split_words(TrainConfig, [f"{key}={text}"])
     if len(text) > _MOST_LETTERS:
-        raise ConfigError(f"{GRID}{key} has {len(text)} letters: give at most {_MOST_LETTERS}.")
+        raise ConfigError(f"{GRID}{key} has {len(text)} characters: give at most {_MOST_LETTERS}.")
     try:
         parsed = OverridesParser.create().parse_override(f"{key}={text}")
         if not parsed.is_sweep_override():

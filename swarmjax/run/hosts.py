@@ -60,7 +60,8 @@ def join(settings: TrainConfig) -> None:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ConfigError(
             f"run.coordinator is {show(run.coordinator)}, but the processes of the run did not "
-            f"meet within {_JOIN_S} s ({reason}): start all of them, and check address and counts."
+            f"connect within {_JOIN_S} s ({reason}): start all of them, and check the address and "
+            "the counts."
         ) from None
     rank.tell_joined()
     _check_alike(settings)
@@ -142,7 +143,7 @@ def lost_peers() -> Iterator[None]:
         if count() == 1:
             raise
         reason = (str(error).splitlines() or [""])[0][:120]
-        raise LostPeerError(f"another process of the run is gone ({reason}).") from None
+        raise LostPeerError(f"another process of the run has ended ({reason}).") from None
 
 
 @contextlib.contextmanager
@@ -191,7 +192,8 @@ def _check_alike(settings: TrainConfig) -> None:
         return
     if mine == first:
         raise ConfigError(
-            f"process {other[0]} has other settings or versions than process 0: give all the same."
+            f"process {other[0]} has other settings or versions than process 0: give all processes "
+            "the same."
         )
     theirs, own = json.loads(first), json.loads(mine)
     key = next(key for key in own if own[key] != theirs.get(key))

@@ -34,7 +34,7 @@ from swarmjax.training.loop import TrainState
 
 _LOWERED = 0.1  # factor on the learning rates of a run that diverged
 _GIVE_UP = (
-    "It had gone back once already: give lower algo.actor_learning_rate and "
+    "The run had already gone back once: give lower algo.actor_learning_rate and "
     "algo.critic_learning_rate, or look at metrics.jsonl for what broke."
 )
 _PRICE = "learners/price/"  # in checkpoints from the time when algo.contact_limit was a key
@@ -160,8 +160,8 @@ def _first_sentences(
         updates = words.count(source.update, "update")
         as_there = describe(settings.robot, settings.task, settings.realism)
         yield (
-            f"starting with what {source.run} had learned after {updates}; robot, task, realism "
-            f"and network are the same as there, unless given here: {as_there}"
+            f"starting with the networks and the normaliser of {source.run} after {updates}; "
+            f"robot, task, realism and network are as in that run, unless given here: {as_there}"
         )
 
 
@@ -171,8 +171,8 @@ def _dealt_again(settings: TrainConfig) -> Iterator[str]:
     now = settings.stream_count
     if now != before:
         yield (
-            f"random numbers come in {words.count(now, 'stream')} from here on, not {before}: what "
-            "was learned is kept, but the levels drawn from here on differ."
+            f"random numbers are drawn in {words.count(now, 'stream')} from here on, not in "
+            f"{before}: what was learned is kept, but the levels drawn from here on differ."
         )
 
 

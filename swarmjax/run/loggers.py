@@ -119,7 +119,7 @@ class Guarded:
         self._put(None)
         self._thread.join(0.0 if self._lost and self._jobs.full() else PATIENCE_S)
         if self._thread.is_alive():
-            self._lose(f"it has not taken everything after {PATIENCE_S:g} s")
+            self._lose(f"it has not finished all calls after {PATIENCE_S:g} s")
 
     def _put(self, job: tuple[Callable[..., None], tuple] | None) -> None:
         """Queues a job. None ends the thread."""

@@ -196,7 +196,7 @@ def _reason(settings: TrainConfig, arenas: int) -> str:
 def _advice(settings: TrainConfig, how: str, arenas: float) -> str:
     """Suggests a number of arenas that can be trained, or another remedy if that does not help."""
     if settings.resume is not None:  # a resumed run cannot change what its memory depends on
-        return "go on with it on a device that has more"
+        return "continue the run on a device with more memory"
     fewest = settings.algo.num_minibatches
     if settings.arenas == fewest:
         return "give fewer seeds, sim.max_robots or algo.rollout_length"

@@ -104,11 +104,11 @@ def _died(code: int, *, joined: bool) -> int:
     if joined:
         sys.stderr.write(
             f"swarmjax.train: error: this process of the run died ({how}), probably because "
-            "another one is gone. What was saved before is kept: go on with resume=auto.\n"
+            "another process has ended. What was saved before is kept: go on with resume=auto.\n"
         )
         return REQUEUE
     sys.stderr.write(
-        "swarmjax.train: error: the processes of the run did not meet within a minute: start as "
+        "swarmjax.train: error: the processes of the run did not connect within a minute: start as "
         "many as run.processes says, and check run.coordinator, the address of the first.\n"
     )
     return USER_ERROR

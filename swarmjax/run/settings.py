@@ -161,7 +161,7 @@ class TrainConfig(ProgramConfig):
         object.__setattr__(self, "sim", make_room(self.sim, self.stage))
         if self.seed + self.seeds - 1 > MAX_COUNT:
             raise ConfigError(
-                f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be "
+                f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be at most "
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()

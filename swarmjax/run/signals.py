@@ -107,7 +107,7 @@ def _watch(read: int, patient: bool) -> None:
             if first is not None:
                 _end(CODES[first])
             first = found
-            _say("stopping after this call, to save; a second signal stops at once")
+            _say("stopping after the current call, to save; a second signal stops at once")
 
 
 def _end(code: int) -> None:

@@ -482,7 +482,7 @@ def _log_episodes(
     if lost:
         display.say(
             f"{EPISODES} lacks {words.count(lost, 'episode')} up to update "
-            f"{updates[-1]:,}: more episodes ended than its buffer holds."
+            f"{updates[-1]:,}: more episodes ended than the buffer can hold."
         )
 
 

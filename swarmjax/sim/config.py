@@ -153,7 +153,7 @@ class SimConfig(Section):
         default="auto",
         metadata=about(
             "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
-            "body, on wheels only with warp; auto: swarm where available",
+            "body, on wheels only with impl=warp; auto: swarm where available",
             renamed={"newton": "mjx"},
         ),
     )

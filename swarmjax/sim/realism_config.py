@@ -138,7 +138,7 @@ class RealismConfig(Section):
         metadata=about("relative SD of the wheel speed; per wheel and control step", 0.0, 1.0),
     )
     speed_quantisation: Literal["epuck1", "epuck2"] | None = field(
-        default=None, metadata=about("rounds to wheel speeds that this firmware can make")
+        default=None, metadata=about("rounds wheel speeds to those that this firmware can set")
     )
     action_latency: tuple[int, int] | None = field(
         default=None,

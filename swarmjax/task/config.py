@@ -36,7 +36,8 @@ class RewardConfig(Section):
         metadata=_weight("per control step before arrival with an object in infrared range"),
     )
     arrival: float = field(
-        default=0.0, metadata=_weight("once, on arrival; with hold, once all have arrived")
+        default=0.0,
+        metadata=_weight("once, on arrival; with arrival=hold, when all robots have arrived"),
     )
     contact: float = field(default=-0.2, metadata=_weight("per contact event of any kind"))
     robot_contact: float = field(
@@ -119,7 +120,10 @@ class TaskConfig(Section):
     )
     encoding: Literal["auto", "metric", "webots"] = field(
         default="auto",
-        metadata=about("what is observed: m and rad, or as in Webots; auto: as realism.infrared"),
+        metadata=about(
+            "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
+            "realism.infrared=webots, else metric"
+        ),
     )
     observations: tuple[str, ...] | None = field(
         default=None,

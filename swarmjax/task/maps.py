@@ -109,7 +109,7 @@ def _check_text(rows: Sequence[str]) -> None:
     for number, row in enumerate(rows, 1):
         if len(row) != len(rows[0]):
             raise ConfigError(
-                f"map has {len(rows[0])} letters in row 1 and {len(row)} in row {number}: give "
+                f"map has {len(rows[0])} characters in row 1 and {len(row)} in row {number}: give "
                 "rows of the same length."
             )
         for column, letter in enumerate(row, 1):
@@ -125,7 +125,7 @@ def _check_text(rows: Sequence[str]) -> None:
                 )
     if max(len(rows), len(rows[0])) > MOST_CELLS:
         raise ConfigError(
-            f"map has {len(rows)} rows of {len(rows[0])} letters: give at most {MOST_CELLS} of "
+            f"map has {len(rows)} rows of {len(rows[0])} characters: give at most {MOST_CELLS} of "
             "each, and larger cells."
         )
 
@@ -172,8 +172,8 @@ def _check_reach(
         if target not in _reached(rows, start):
             raise ConfigError(
                 f"map has a target in row {target[0] + 1}, column {target[1] + 1} that cannot be "
-                f"reached from the start in row {start[0] + 1}, column {start[1] + 1}: leave a way "
-                "of cells that share edges."
+                f"reached from the start in row {start[0] + 1}, column {start[1] + 1}: leave a "
+                "path of cells that share edges."
             )
 
 

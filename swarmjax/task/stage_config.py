@@ -79,7 +79,7 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     if len(found.wall) > _MOST_OBSTACLES:
         raise ConfigError(
             f"map has walls of {len(found.wall)} rectangles: give at most {_MOST_OBSTACLES}; "
-            "straight walls take the fewest."
+            "straight walls need the fewest rectangles."
         )
     return found
 
@@ -189,7 +189,8 @@ class StageConfig(Section):
         for key, value in said.items():
             if getattr(self, key) != value:
                 raise ConfigError(
-                    f"{key} is {show(getattr(self, key))}, but map says {value}: leave {key} out."
+                    f"{key} is {show(getattr(self, key))}, but map sets it to {value}: leave {key} "
+                    "out."
                 )
         self._check_robots(drawn)
 
@@ -201,8 +202,8 @@ class StageConfig(Section):
             )
         if self.robots > pairs and not len(drawn.start):
             raise ConfigError(
-                f"robots is {self.robots}, but map has letters for {pairs} and no S and T: give "
-                f"{pairs}, or areas S and T for the others."
+                f"robots is {self.robots}, but map has letters for {pairs} and no areas S and T: "
+                f"give {pairs}, or add areas S and T for the other robots."
             )
 
     def _check_layout(self) -> None:
@@ -372,7 +373,7 @@ class GridConfig(Section):
         if not self.stages():
             least = min(self._least(cell) for cell in self._cells())
             raise ConfigError(
-                f"side is {show(self.side)}, too small for every cell of the grid: the fewest "
+                f"side is {show(self.side)}, too small for every cell of the grid: even the fewest "
                 f"robots and obstacles need {math.ceil(100 * least) / 100}."
             )
 

@@ -31,7 +31,7 @@ class ProgramConfig(Section):
     seeds: int = field(
         default=1,
         metadata=about(
-            "runs trained at once, of seed, seed + 1, ...",
+            "number of runs trained at once, with seeds seed, seed + 1, ...",
             1,
             4096,
             reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
@@ -41,9 +41,9 @@ class ProgramConfig(Section):
     seeds_by: Literal["vmap", "map", "cores", "devices"] = field(
         default="vmap",
         metadata=about(
-            "vmap: side by side; map: one after the other, bit for bit as in a run of one seed; "
-            "cores: vmap, in a group for each core of a CPU; devices: vmap, in a group for each "
-            "device"
+            "how to train the seeds; vmap: side by side; map: one after the other, bit for bit as "
+            "in a run of one seed; cores: vmap, in a group for each core of a CPU; devices: vmap, "
+            "in a group for each device"
         ),
     )
     arenas: int = field(
@@ -53,7 +53,10 @@ class ProgramConfig(Section):
     devices: int = field(
         default=1,
         metadata=about(
-            "devices that share every seed's arenas; with seeds_by=devices, the seeds", 1, 2**16
+            "number of devices that share the arenas of every seed; with seeds_by=devices, they "
+            "share the seeds",
+            1,
+            2**16,
         ),
     )
     streams: int | None = field(

@@ -28,7 +28,7 @@ class WatchConfig(Section):
     extensions: str | None = field(
         default=None,
         metadata=about(
-            "Python file with the pieces that the run was trained with, which will be executed; "
+            "Python file with the pieces that the run was trained with; it is executed; "
             "null: a policy that needs such pieces is not replayed"
         ),
     )

@@ -98,7 +98,7 @@ def _elsewhere(so_far: str, age: float | None) -> Standing:
         return Standing("elsewhere", f"It trains: {so_far}; {_written(age)}.")
     return Standing(
         "silent",
-        f"It was killed or still trains, which cannot be seen from here: {so_far}; "
+        f"It was killed or is still training, and this machine cannot tell which: {so_far}; "
         f"{_written(age)}.",
     )
 
@@ -115,7 +115,7 @@ def _age(run: Path) -> float | None:
 def _written(age: float | None) -> str:
     if age is None:
         return "no update is written yet"
-    return f"the newest was written {words.duration(round(age))} ago"
+    return f"the newest update was written {words.duration(round(age))} ago"
 
 
 def _left(trained: TrainConfig, found: Progress) -> str:

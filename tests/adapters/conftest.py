@@ -1,4 +1,4 @@
-"""Small swarms, and courses of theirs that every adapter has to follow."""
+"""Small swarms and their courses: reference rollouts that every adapter must reproduce."""
 
 import pytest
 from courses import ARENA_SEED, ONE, PAIR, SEED, TASK, Course, drawn_key, follow
@@ -9,7 +9,7 @@ from swarmjax.environment import Swarm
 
 @pytest.fixture(scope="session")
 def swarm() -> Swarm:
-    """Four arenas, with two robots and one in turn: six robots on eight places."""
+    """Returns four arenas, alternately of two robots and one: six robots in eight places."""
     return swarmjax.make_env([PAIR, ONE], task=TASK, arenas=4)
 
 

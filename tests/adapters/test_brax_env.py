@@ -1,4 +1,4 @@
-"""Brax sees the environment robot by robot, and learns nothing from those that wait."""
+"""Tests that each robot is one Brax environment and that Brax ignores robots that wait."""
 
 import warnings
 from typing import Any
@@ -12,7 +12,7 @@ from courses import LIMIT, SEED, Course, assert_close, drawn_key, follow, robots
 from swarmjax.environment import Swarm
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
+    warnings.simplefilter("ignore")  # Brax imports JAXopt, which warns that it is unmaintained
     from brax.envs.base import Env
 
     from swarmjax.adapters.brax_env import SwarmBraxEnv, mended_jax
@@ -39,7 +39,7 @@ def test_it_is_one_of_braxs(env: SwarmBraxEnv, states: list) -> None:
         assert (state.obs.shape, state.obs.dtype) == ((6, 10), jnp.float32)
         for each in (state.reward, state.done, state.info["truncation"]):
             assert (each.shape, each.dtype) == ((6,), jnp.float32)
-    # What `lax.scan` carries keeps its structure.
+    # `lax.scan` requires its carry to keep one structure.
     assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
 
 
@@ -79,7 +79,7 @@ def test_another_number_of_environments_is_refused(env: SwarmBraxEnv) -> None:
 
 def test_jax_is_mended_for_a_while() -> None:
     name = "device_put_replicated"
-    assert not hasattr(jax, name)  # else the shim may go
+    assert not hasattr(jax, name)  # if JAX has it again, remove the shim
     with mended_jax():
         tree = {"a": jnp.arange(3.0)}
         found = getattr(jax, name)(tree, jax.local_devices()[:1])
@@ -97,10 +97,11 @@ def test_braxs_evaluator_counts_targets_reached(env: SwarmBraxEnv, course: Cours
     key = jax.random.key(0)
     evaluator = acting.Evaluator(env, steering, 6, LIMIT, 1, key)
     found = evaluator.run_evaluation(None, {}, aggregate_episodes=True)
-    # The evaluator's keys: the second half of its own, and of that the first of six.
+    # The evaluator splits its key in two, and the second part into six keys, one per environment.
+    # The adapter uses only the first of the six.
     bare = follow(env.robots.swarm, jax.random.split(jax.random.split(key)[1], 6)[0])
     reached, over = bare.came.terminated, bare.came.done.cumsum(axis=0) - bare.came.done > 0
-    first = reached & ~over[..., None]  # in the first episode of each arena
+    first = reached & ~over[..., None]  # counts only the first episode of each arena
     assert found["eval/episode_reached"] == pytest.approx(first.sum() / 6)
     assert 0 < first.sum() < 6
 

@@ -1,4 +1,4 @@
-"""The code of docs/adapters.md runs as it is written."""
+"""Checks that the code of docs/adapters.md runs as written."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,7 @@ _TORCH = ("Stable-Baselines3", "PyTorch")
         for each in _BLOCKS
     ],
 )
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # JAXopt's own, which Brax imports
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Brax imports JAXopt, which warns
 def test_the_code_of_a_section_runs(section: str) -> None:
     exec(compile(_BLOCKS[section], f"docs/adapters.md, {section}", "exec"), {})
 

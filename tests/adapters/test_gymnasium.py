@@ -1,4 +1,4 @@
-"""The contract of Gymnasium's vector environments; it has no checker for them."""
+"""Tests the contract of Gymnasium's vector environments, for which Gymnasium has no checker."""
 
 import gymnasium
 import numpy as np
@@ -94,7 +94,7 @@ def test_what_was_returned_stays_as_it_was(envs: SwarmVectorEnv) -> None:
     seen, _ = envs.reset(seed=0)
     kept = seen.copy()
     later = envs.step(envs.action_space.sample())[0]
-    later[:] = 0.0  # the caller's own
+    later[:] = 0.0  # the array belongs to the caller
     np.testing.assert_array_equal(seen, kept)
     assert envs.step(envs.action_space.sample())[0].any()
 
@@ -102,12 +102,12 @@ def test_what_was_returned_stays_as_it_was(envs: SwarmVectorEnv) -> None:
 def test_gymnasiums_wrappers_take_it(envs: SwarmVectorEnv, course: Course) -> None:
     wrapped = RecordEpisodeStatistics(envs)
     wrapped.reset(seed=SEED)
-    ended = int(np.argmax(course.came.done[:, 1]))  # the second arena has one robot, the third here
+    ended = int(np.argmax(course.came.done[:, 1]))  # arena 1 has one robot, at index 2
     infos = [wrapped.step(robots(action))[4] for action in course.action[: ended + 1]]
     info = infos[-1]
     assert info["episode"]["l"][2] == ended + 1
     earned = course.came.reward[: ended + 1, 1, 0].sum()
-    np.testing.assert_allclose(info["episode"]["r"][2], earned, rtol=1e-4)  # sums of float32
+    np.testing.assert_allclose(info["episode"]["r"][2], earned, rtol=1e-4)  # sums in float32
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_reset_that_cannot_be_is_refused(envs: SwarmVectorEnv, given: dict) ->
 
 
 def test_a_closed_one_is_of_no_use(closed: SwarmVectorEnv) -> None:
-    closed.close()  # twice is once
+    closed.close()  # a second close does nothing
     with pytest.raises(gymnasium.error.ClosedEnvironmentError):
         closed.reset()
     with pytest.raises(gymnasium.error.ClosedEnvironmentError):

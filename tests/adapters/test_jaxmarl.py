@@ -1,4 +1,4 @@
-"""The contract of JaxMARL's environments; it has no checker."""
+"""Tests the contract of JaxMARL's environments, for which JaxMARL has no checker."""
 
 import contextlib
 import io
@@ -12,7 +12,8 @@ from courses import ARENA_SEED, LIMIT, Course, assert_close, drawn_key
 
 from swarmjax.environment import Swarm
 
-# It says which of its environments it lacks; JAXopt, which it imports, that nobody keeps it up.
+# On import, JaxMARL prints which of its environments are missing. It also imports JAXopt, which
+# warns that it is unmaintained.
 with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
     warnings.simplefilter("ignore")
     from jaxmarl.environments.multi_agent_env import MultiAgentEnv
@@ -21,7 +22,7 @@ with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
     from swarmjax.adapters.jaxmarl import SwarmMultiAgentEnv
 
 AGENTS = ["agent_0", "agent_1"]
-ARRIVED = 42  # the step in which the first robot does, see courses.py
+ARRIVED = 42  # index of the step in which agent_0 arrives, see courses.py
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def env(arena: Swarm) -> SwarmMultiAgentEnv:
 
 @pytest.fixture(scope="module")
 def steps(env: SwarmMultiAgentEnv, arena_course: Course) -> list[tuple]:
-    """Of two arenas of one seed, mapped: observations, states, rewards, dones, infos."""
+    """Returns the steps of two vmapped arenas with one seed, as `env.step` returns them."""
     keys = jnp.stack([drawn_key(ARENA_SEED)] * 2)
     _, state = jax.vmap(env.reset)(keys)
     step, found = jax.jit(jax.vmap(env.step)), []

@@ -1,4 +1,4 @@
-"""PettingZoo's own checker, and what it does not look at."""
+"""Runs PettingZoo's own checker, and tests what the checker does not cover."""
 
 import warnings
 
@@ -21,7 +21,10 @@ def env(arena: Swarm) -> SwarmParallelEnv:
 
 @pytest.fixture(scope="module")
 def steps(env: SwarmParallelEnv, arena_course: Course) -> list[tuple]:
-    """Who acts, and what comes of it, until nobody is left; those that left are told too."""
+    """Returns the acting agents and the outcome of each step, until no agent is left.
+
+    Agents that have left still receive actions.
+    """
     env.reset(seed=ARENA_SEED)
     found, told = [], iter(arena_course.action)
     while env.agents:
@@ -33,7 +36,7 @@ def steps(env: SwarmParallelEnv, arena_course: Course) -> list[tuple]:
 
 def test_the_checker_passes(env: SwarmParallelEnv, capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # the checker only warns of much that is wrong
+        warnings.simplefilter("error")  # the checker reports many faults only as warnings
         parallel_api_test(env, num_cycles=LIMIT + 5)
     assert "Passed" in capsys.readouterr().out
 

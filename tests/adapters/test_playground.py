@@ -1,4 +1,4 @@
-"""One arena as an environment of MuJoCo Playground; it has no checker."""
+"""Tests one arena as an environment of MuJoCo Playground, which has no checker."""
 
 import warnings
 from typing import Any
@@ -12,7 +12,7 @@ from courses import ARENA_SEED, LIMIT, Course, assert_close, drawn_key
 from swarmjax.environment import Swarm
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # JAXopt, which Brax imports, says that nobody keeps it up
+    warnings.simplefilter("ignore")  # Brax imports JAXopt, which warns that it is unmaintained
     from mujoco_playground import MjxEnv, wrapper
 
     from swarmjax.adapters.playground import SwarmMjxEnv
@@ -51,7 +51,7 @@ def test_it_follows_the_course(states: list, arena_course: Course) -> None:
         assert_close(state.obs, arena_course.after[t].ravel())
         assert_close(state.reward, came.reward[t].sum())
         assert_close(state.metrics["reached"], came.terminated[t].sum() / 2)
-        assert state.done == 0.0  # by this seed the time runs out, which is the wrapper's
+        assert state.done == 0.0  # a robot times out, and only the wrapper reports that
 
 
 def test_done_says_that_all_have_arrived(env: SwarmMjxEnv, states: list) -> None:
@@ -63,7 +63,7 @@ def test_done_says_that_all_have_arrived(env: SwarmMjxEnv, states: list) -> None
 
 
 def test_playgrounds_wrapper_ends_episodes_and_draws_new_levels(wrapped: Any) -> None:
-    keys = jax.random.split(jax.random.PRNGKey(0), 3)  # Brax's wrappers know no newer ones
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)  # Brax's wrappers take only old-style keys
     state, step = jax.jit(wrapped.reset)(keys), jax.jit(wrapped.step)
     first = state.obs
     for _ in range(LIMIT - 1):
@@ -71,9 +71,9 @@ def test_playgrounds_wrapper_ends_episodes_and_draws_new_levels(wrapped: Any) ->
         assert not state.done.any()
     state = step(state, jnp.zeros((3, 4)))
     np.testing.assert_array_equal(state.done, np.ones(3))
-    # Playground 0.2.0 forgets `truncation` with `full_reset`, as it does all of `info`.
+    # With `full_reset`, Playground 0.2.0 drops all of `info`, including `truncation`.
     assert (state.obs != first).any(axis=1).all()
-    # What is seen belongs to what is stepped on.
+    # The observation belongs to the state from which the next step starts.
     np.testing.assert_array_equal(state.obs, state.data.observation.reshape(3, -1))
 
 

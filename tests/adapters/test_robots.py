@@ -1,4 +1,4 @@
-"""Robots in a row are those of the arenas, and only those that are there."""
+"""Tests that a row of robots holds every present robot of the arenas and no absent robot."""
 
 import jax
 import numpy as np
@@ -20,10 +20,10 @@ def test_absent_robots_are_left_out(swarm: Swarm) -> None:
 
 def test_the_course_has_all_that_can_happen(course: Course) -> None:
     came, over = course.came, course.came.done[..., None]
-    assert (came.terminated & ~over).any()  # one arrives and waits
-    assert (came.terminated & over).any()  # the last arrives
+    assert (came.terminated & ~over).any()  # a robot arrives and waits
+    assert (came.terminated & over).any()  # the last robot of an arena arrives
     assert came.truncated.any()
-    assert (over.all(axis=-1).sum(axis=0) > 1).any()  # an arena ends twice
+    assert (over.all(axis=-1).sum(axis=0) > 1).any()  # an arena ends two episodes
 
 
 def test_robots_follow_the_course(swarm: Swarm, course: Course) -> None:

@@ -1,4 +1,7 @@
-"""The contract of Stable-Baselines3's vector environments; its checker is for single ones."""
+"""Tests the contract of Stable-Baselines3's vector environments.
+
+Stable-Baselines3 has a checker for single environments only.
+"""
 
 import gymnasium
 import numpy as np

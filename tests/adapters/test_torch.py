@@ -1,4 +1,4 @@
-"""PyTorch's tensors are JAX's memory, and the environment is the same."""
+"""Tests that PyTorch tensors share JAX's memory and that the environment acts as in JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def env(swarm: Swarm):
 
 
 def test_it_follows_the_course(env, course: Course) -> None:
-    # The course starts from the key that adapters of NumPy's make of the seed.
+    # The course starts from the key that the NumPy adapters derive from the seed.
     seen = env.reset(int(np.random.default_rng(SEED).integers(2**31)))
     assert_close(seen.numpy(), robots(course.seen[0]))
     for t, action in enumerate(course.action):

@@ -1,4 +1,4 @@
-"""What the command of the baselines takes, refuses and prints."""
+"""Checks which words the command `baselines` takes and refuses, and what it prints."""
 
 import json
 import sys
@@ -33,7 +33,7 @@ def test_a_line_says_who_where_and_what_came_of_it(capsys: pytest.CaptureFixture
 def test_straight_steers_at_its_target_whatever_the_infrared_says(
     tmp_path: Path, bearing: float, action: list[float]
 ) -> None:
-    """Full speed and twice the bearing as a turn, slower the further the target is off the nose."""
+    """The turn is twice the bearing; the speed falls from full speed as the bearing grows."""
     baselines.write(tmp_path / "policy.npz", *baselines.POLICIES["straight"])
     straight = policy_file.read(str(tmp_path / "policy.npz"))
     for ray in (0.0, 0.04):

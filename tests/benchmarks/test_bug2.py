@@ -1,4 +1,4 @@
-"""Bug2 step by step, worked out by hand, and on a map that the straight line fails."""
+"""Tests Bug2 on single steps worked out by hand, and on a map on which `straight` fails."""
 
 from pathlib import Path
 
@@ -10,26 +10,26 @@ from benchmarks.bug2 import BugBody, BugMemory
 from swarmjax.sim.drive import Drive
 from swarmjax.task import observation
 
-FREE = 0.04  # m, of a ray that meets nothing
+FREE = 0.04  # m; length of a ray that meets nothing
 BODY = BugBody(Drive(0.02, 0.052, 6.28, 0.1256, 3.14), 0.037, 0.05, FREE, 0.032)
 MAPS = Path(baselines.__file__).parent / "maps"
-LEFT, RIGHT = (7, 6, 5, 4), (0, 1, 2, 3)  # rays from ahead to behind
+LEFT, RIGHT = (7, 6, 5, 4), (0, 1, 2, 3)  # the rays of each side, from front to back
 
 
 def _seen(distance: float, bearing: float, **rays: float) -> np.ndarray:
-    """An observation [O]; a ray is `ray0` to `ray7`."""
+    """Returns an observation [O]; the keys `ray0` to `ray7` set the lengths of rays, m."""
     lengths = [rays.get(f"ray{i}", FREE) for i in range(observation.SENSORS)]
     return np.array([*lengths, distance, bearing])
 
 
 def _follower(seen: np.ndarray, **changes: object) -> BugMemory:
-    """A robot that follows an outline since it left the line 0.8 m from its target."""
+    """Returns the memory of a robot that left the line 0.8 m from its target for an outline."""
     arrays = {name: np.asarray(value) for name, value in changes.items()}
     return bug2.start(seen)._replace(following=np.array(True), hit=np.array(0.8), **arrays)
 
 
 def _twist(action: np.ndarray) -> tuple[float, float]:
-    """Speed in m/s and turn rate in rad/s."""
+    """Returns the speed (m/s) and turn rate (rad/s) of an action."""
     return 0.0628 * (action[0] + 1.0), 3.14 * action[1]
 
 
@@ -51,10 +51,12 @@ def test_what_bars_the_line_is_passed_with_it_on_the_left(ray: int) -> None:
 
 @pytest.mark.parametrize(("side", "near"), [(1.0, LEFT), (-1.0, RIGHT)])
 def test_it_keeps_to_its_side(side: float, near: tuple[int, ...]) -> None:
-    """Along a wall at the wanted gap it drives on; too close it turns away, too far it turns to it.
+    """A robot too close to a wall turns away, one too far turns to the wall, else it drives on.
 
-    The ray beside begins 0.031 m off the middle, the diagonal one at 0.025 m, at 0.8 rad (0.79920,
-    on the right 0.80081): a wall at 0.037 + 0.012 m leaves 0.018 m and 0.024 / sin 0.8 = 0.0335 m.
+    The sideways ray begins 0.031 m to the side of the robot's middle. The diagonal ray begins
+    0.025 m to the side, at a yaw of 0.8 rad (0.79920 on the left, 0.80081 on the right). A wall at
+    0.037 + 0.012 m leaves 0.018 m for the sideways ray and 0.024 / sin 0.8 = 0.0335 m for the
+    diagonal ray.
     """
     turns = {}
     for gap in (0.009, 0.012, 0.015):
@@ -64,7 +66,8 @@ def test_it_keeps_to_its_side(side: float, near: tuple[int, ...]) -> None:
         memory, action = bug2.act(memory, seen, BODY)
         assert (memory.side, bool(memory.following)) == (side, True)
         turns[gap] = side * _twist(action)[1]
-    # 60 rad/s for each metre: 0.18 rad/s for 3 mm; the angle of the wall is 0 but for 1 in 1,000.
+    # The gain is 60 rad/s per metre, so 3 mm give 0.18 rad/s. The angle of the wall is 0 to within
+    # 1 in 1,000.
     assert list(turns.values()) == pytest.approx([-0.18, 0.0, 0.18], abs=0.02)
 
 
@@ -75,7 +78,7 @@ def test_a_wall_before_it_is_turned_away_from_on_the_spot() -> None:
 
 
 def test_round_a_corner_it_drives_a_circle_about_it() -> None:
-    """0.08 m/s about a corner 0.037 + 0.012 m off the middle: 1.633 rad/s."""
+    """The robot drives at 0.08 m/s around a corner 0.037 + 0.012 m from its middle: 1.633 rad/s."""
     seen = _seen(0.9, 0.5)
     _, action = bug2.act(_follower(seen), seen, BODY)
     assert _twist(action) == pytest.approx((0.08, 0.08 / 0.049))
@@ -85,9 +88,9 @@ def test_round_a_corner_it_drives_a_circle_about_it() -> None:
     ("distance", "leaves"), [(0.76, True), (0.79, False), (0.9, False)], ids=str
 )
 def test_it_leaves_the_outline_where_the_line_is_met_nearer(distance: float, leaves: bool) -> None:
-    """At 0 rad of heading and bearing it is on the line; a control step ago it was 1 mm off it.
+    """The robot is on the line at heading and bearing 0; one step ago it was 1 mm off the line.
 
-    It left the line at 0.8 m; 0.03 m nearer is 0.77 m.
+    It left the line 0.8 m from its target, and 0.03 m closer is 0.77 m.
     """
     seen = _seen(distance, 0.0)
     memory = _follower(seen, beyond=0.001)
@@ -96,7 +99,7 @@ def test_it_leaves_the_outline_where_the_line_is_met_nearer(distance: float, lea
 
 
 def test_it_does_not_leave_beside_the_line() -> None:
-    seen = _seen(0.5, 0.1)  # 0.5 sin 0.1 = 0.05 m beside it, as before
+    seen = _seen(0.5, 0.1)  # 0.5 sin 0.1 = 0.05 m beside the line, as one step ago
     memory = _follower(seen, heading=0.0, beyond=-0.05)
     memory, _ = bug2.act(memory, seen, BODY)
     assert memory.following
@@ -104,7 +107,7 @@ def test_it_does_not_leave_beside_the_line() -> None:
 
 
 def test_its_heading_is_what_its_wheels_turned() -> None:
-    """On the spot at 2.5 rad/s, for 0.032 s: 0.08 rad to the right."""
+    """The robot turns to the right on the spot at 2.5 rad/s for 0.032 s, by 0.08 rad."""
     seen = _seen(0.9, 0.0, ray7=0.02)
     memory, _ = bug2.act(_follower(seen), seen, BODY)
     assert memory.heading == pytest.approx(-0.08)
@@ -113,16 +116,18 @@ def test_its_heading_is_what_its_wheels_turned() -> None:
 @pytest.mark.parametrize(
     ("change", "side"),
     [
-        ({"lost": 0.34}, 1.0),  # an outline that is gone: on as ever
-        ({"waited": 3.1}, -1.0),  # stuck: the other side
-        ({"way": 0.5, "mark": [-0.9, 0.0, -0.5], "marked": 0.1}, -1.0),  # all the way round
+        # If the outline is gone, the robot keeps the default side. It changes sides if it is stuck,
+        # or if it has gone all the way round the outline.
+        ({"lost": 0.34}, 1.0),
+        ({"waited": 3.1}, -1.0),
+        ({"way": 0.5, "mark": [-0.9, 0.0, -0.5], "marked": 0.1}, -1.0),
     ],
     ids=["gone", "stuck", "round"],
 )
 def test_the_line_starts_anew_where_the_outline_makes_no_sense(
     change: dict[str, object], side: float
 ) -> None:
-    """From where it is to the target, so that the bearing of 0.5 rad is a heading of -0.5 rad."""
+    """The new line leads from the robot to its target: a bearing of 0.5 means heading -0.5 rad."""
     seen = _seen(0.9, 0.5)
     memory, _ = bug2.act(_follower(seen, heading=-0.5, **change), seen, BODY)
     assert not memory.following

@@ -1,4 +1,4 @@
-"""The study of curricula: its arms and points, what it measures, and its tables, by hand."""
+"""Tests the study of curricula: arms, points, measures, and tables worked out by hand."""
 
 import json
 import sys
@@ -84,7 +84,8 @@ def test_a_hard_goal_ends_its_own_curriculum(goal: str) -> None:
     (alone,) = curriculum_arms.load_arm(study, "final", "shared", ROOM).stage
     stages = curriculum_arms.load_arm(study, "mixed", "shared", ROOM).stage
     assert stages[-1] == alone
-    assert max(side for stage in stages for side in stage.sides) <= 1.2  # 1.5 m is held out
+    # An arena of 1.5 m is held out.
+    assert max(side for stage in stages for side in stage.sides) <= 1.2
     for key in ("robots", "obstacles"):
         numbers = [getattr(stage, key) for stage in stages]
         assert numbers == sorted(numbers)  # the easiest first
@@ -101,17 +102,18 @@ def test_levels_of_hard_stages_leave_nothing_out(name: str) -> None:
         drawn = level.sample(uniforms, one, spacing, np)
         assert drawn.present.all()
         assert drawn.obstacle_present.all()
-        assert np.abs(drawn.obstacle[:, :2]).max() < 0.6  # none is parked
+        assert np.abs(drawn.obstacle[:, :2]).max() < 0.6  # no obstacle is parked outside
 
 
 def test_points_are_even_in_the_logarithm() -> None:
-    # 16 arenas of 32 steps make updates of 512; 1e5 of these are 195.3 of them, 1e6 are 1953.1.
+    # 16 arenas of 32 control steps make updates of 512 arena steps. So 1e5 arena steps are 195.3
+    # updates, and 1e6 arena steps are 1953.1 updates.
     trained = load_train(["arenas=16", "budget=1e6"])
     found = curriculum_arms.points(StudyConfig(points=3, first=100_000), trained)
-    # The middle one: sqrt(195 * 1953) = 617.1.
+    # The middle point is at update sqrt(195 * 1953) = 617.1.
     np.testing.assert_array_equal(found, [195, 617, 1953])
     few = curriculum_arms.points(StudyConfig(points=9, first=1), replace(trained, budget=512 * 4))
-    np.testing.assert_array_equal(few, [1, 2, 3, 4])  # nine of them fall on four updates
+    np.testing.assert_array_equal(few, [1, 2, 3, 4])  # nine points fall on four updates
     sentence = refusal(curriculum_arms.points, StudyConfig(first=10**6), trained)
     assert "give less than 999936" in sentence  # 1953 * 512
 
@@ -126,7 +128,8 @@ def test_the_held_out_arena_is_for_swarms_of_its_size() -> None:
         "held_out": ("expanded", (1.5, 1.5)),
     }
     ten = load_train([*ROOM, "stage=crowd"])
-    # Nor is the first stage: the baseline has trained with ten robots alone.
+    # With ten robots there is neither a held-out arena nor a first stage to judge: the baseline
+    # trains only with ten robots.
     assert curriculum_arms.roles(StudyConfig(goal="crowd"), ten, ROOM).keys() == {"goal"}
 
 
@@ -147,7 +150,7 @@ def trained(tiny_config: TrainConfig) -> TrainConfig:
 
 
 def _count(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
-    """Instead of a judge: how many transitions each policy's normaliser has seen."""
+    """Stands in for a judge: returns how many transitions each policy's normaliser has seen."""
     return {"goal": {"targets_reached": np.asarray(learners.normalizer.count[:, 0])}}
 
 
@@ -158,7 +161,8 @@ def test_an_arm_is_judged_at_its_points(trained: TrainConfig) -> None:
     seen = np.array(curves.judged["goal"]["targets_reached"])
     np.testing.assert_array_equal(seen, curves.transitions)
     assert (seen[:, 0] > 0).all()
-    # 8 arenas of two robots or three for 8 control steps; those that arrive early add fewer.
+    # An update has 8 arenas of two or three robots and 8 control steps. Robots that arrive early
+    # add fewer transitions.
     assert (np.diff(seen, prepend=0) <= 8 * 3 * 8 * np.diff(at, prepend=0)).all()
     assert np.array(curves.stage).shape == (3, 3)
     np.testing.assert_allclose(np.sum(curves.mix, axis=1), 1.0, atol=3e-4)  # rounded to 1e-4
@@ -173,7 +177,7 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
     sizes = (observation.SIZE, programs.ACTION_SIZE, 1)
     start = jax.vmap(jax.vmap(lambda key: ppo.init(key, trained.algo, *sizes)))
     learners = start(keys)
-    # Untrained policies hardly move: these drive ahead, at two speeds.
+    # Untrained policies hardly move, so a bias makes both seeds drive ahead, at different speeds.
     learners.params["actor"]["mean"]["bias"] += np.array([[[1.0, 0.0]], [[0.5, 0.3]]], np.float32)
     found = curriculum.load_judge(study, trained, judged)(learners)
     world = programs.load_world(
@@ -230,13 +234,13 @@ def test_figures_by_hand() -> None:
     found = curriculum_table.figures(_line("mixed"), "targets_reached")
     np.testing.assert_allclose(found.goal, [1.0, 0.8, 0.6, 0.9])
     assert found.held_out is None
-    # Straight between the points: the first seed is half-way from 0.6 to 1 at 550,000 steps.
+    # Curves are interpolated linearly: at 550,000 steps the first seed is half-way from 0.6 to 1.
     np.testing.assert_allclose(found.steps[0.8], [550_000, 1_000_000, np.inf, 100_000])
-    # And three quarters of the way at 775,000.
+    # At 775,000 steps the first seed is three quarters of the way from 0.6 to 1.
     np.testing.assert_allclose(found.steps[0.9], [775_000, np.inf, np.inf, 1_000_000])
-    # Trapezoids of 90,000 and 900,000 steps: their shares of the span are 1/11 and 10/11.
+    # The trapezoids span 90,000 and 900,000 steps: 1/11 and 10/11 of the whole span.
     np.testing.assert_allclose(found.area[0], (0.4 + 10 * 0.8) / 11)
-    # Of one decade each.
+    # On the logarithmic axis each trapezoid spans one decade.
     np.testing.assert_allclose(found.log_area, [0.6, 0.45, 0.25, 0.725])
     assert found.forgotten is not None
     np.testing.assert_allclose(found.forgotten, [0.3, 0.0, 0.1, 0.1])
@@ -245,7 +249,7 @@ def test_figures_by_hand() -> None:
 
 
 def test_table_by_hand() -> None:
-    # Every seed of the better arm ends higher than any of the baseline, and learns sooner.
+    # Every seed of the better arm ends higher than any seed of the baseline, and learns sooner.
     better = [[0.9, 1.0, 1.0]] * 4
     worse = [[0.0, 0.1, 0.5]] * 4
     arms = curriculum_table.tables([_line("mixed", better), _line("final", worse)])
@@ -254,13 +258,14 @@ def test_table_by_hand() -> None:
     assert text[0] == "### s6, shared, 16 arenas, 1,000,000 arena steps: targets reached"
     assert text[2].startswith("| arm | goal | 1.5 m | to 0.8 | to 0.9 | area |")
     baseline, mixed = ([cell.strip() for cell in row.split("|")[1:-1]] for row in text[4:])
-    # Equal seeds leave no interval. Area by steps: (0.05 + 10 * 0.3) / 11 and (0.95 + 10) / 11.
+    # All seeds are equal, so intervals have no width. Areas over steps: (0.05 + 10 * 0.3) / 11 for
+    # the baseline, and (0.95 + 10) / 11 for the better arm.
     never, soon = "never (never to never)", "10,000 (10,000 to 10,000)"
     assert baseline[:5] == ["final", "0.500 (0.500 to 0.500)", "-", never, never]
     assert baseline[5].startswith("0.277")
     assert mixed[:5] == ["mixed", "1.000 (1.000 to 1.000)", "-", soon, soon]
     assert mixed[5].startswith("0.995")
-    assert mixed[7].startswith("0.100")  # of 0.3, 0, 0.1 and 0.1 the middle two
+    assert mixed[7].startswith("0.100")  # the mean of the middle two of 0.3, 0, 0.1 and 0.1
     assert baseline[8:] == ["-", "-"]
     assert mixed[8:] == ["1.00 (1.00 to 1.00)"] * 2
 
@@ -272,7 +277,7 @@ def test_arms_that_were_not_judged_on_the_first_stage_have_a_dash() -> None:
     text = curriculum_table.table(KEY, arms, "targets_reached").splitlines()
     forgotten = {row.split("|")[1].strip(): row.split("|")[8].strip() for row in text[4:]}
     assert forgotten["final"] == "-"
-    assert forgotten["mixed"].startswith("0.100")  # of 0.3, 0, 0.1 and 0.1 the middle two
+    assert forgotten["mixed"].startswith("0.100")  # the mean of the middle two of the four seeds
     axes = Figure().subplots()
     curriculum_table._draw_curves(axes, arms, "first", "targets_reached")
     assert [line.get_label() for line in axes.get_lines()] == ["mixed"]
@@ -310,7 +315,7 @@ def test_curves_are_drawn_as_interquartile_means() -> None:
     curriculum_table._draw_curves(axes, {"mixed": _line("mixed")}, "goal", "targets_reached")
     (drawn,) = axes.get_lines()
     np.testing.assert_array_equal(drawn.get_xdata(), STEPS)
-    # The middle two of each point: 0.2 and 0.2, 0.4 and 0.6, 0.8 and 0.9.
+    # The middle two of the four seeds have 0.2 and 0.2, then 0.4 and 0.6, then 0.8 and 0.9.
     np.testing.assert_allclose(np.asarray(drawn.get_ydata(), float), [0.2, 0.5, 0.85])
     assert axes.get_xscale() == "log"
 
@@ -370,7 +375,7 @@ def test_errors_of_the_table_are_one_sentence(
     path.write_text(json.dumps(_line("final")))
     assert _run(monkeypatch, str(path), f"out={file}/x") == 2
     said = capsys.readouterr()
-    # The tables are no half of an answer: nothing is printed.
+    # The plots cannot be written, so the tables are not printed either.
     expected = f"out is {file}/x, which cannot be written: Not a directory.\n"
     assert (said.out, said.err) == ("", f"swarmjax.curriculum_table: error: {expected}")
     line = _line("final")

@@ -1,4 +1,4 @@
-"""The model of several devices, by hand, and the page that it is written into."""
+"""Tests the model of several devices by hand, and the page that its results are written into."""
 
 import json
 from pathlib import Path
@@ -16,8 +16,8 @@ LINE = {
     "arenas": 1000,
     "arenas_in_all": 2000,
     "sums": 21,
-    "arena_steps_per_s_of_one": 3.2e6,  # 10 ms for 1000 arenas of 32 control steps
-    "arena_steps_per_s": 5.0e6,  # 12.8 ms
+    "arena_steps_per_s_of_one": 3.2e6,  # 10 ms for 1000 arenas of 32 control steps.
+    "arena_steps_per_s": 5.0e6,  # 12.8 ms for 2000 arenas.
     "efficiency": [0.78, 0.7, 0.8],
 }
 SUM = {"benchmark": "all_reduce", "bytes": 65_536, "microseconds": 20.0}
@@ -28,7 +28,7 @@ SUM = {"benchmark": "all_reduce", "bytes": 65_536, "microseconds": 20.0}
     [
         (1, 1.0),
         (2, 10.0 / (10.0 + 13 * 0.02 + 0.564 * 0.5)),
-        (64, 10.0 / (10.0 + 13 * (0.02 + 0.015 * 3) + 2.34 * 0.5)),  # 8 hosts: three doublings
+        (64, 10.0 / (10.0 + 13 * (0.02 + 0.015 * 3) + 2.34 * 0.5)),  # 8 hosts are three doublings
     ],
 )
 def test_predict(devices: int, expected: float) -> None:

@@ -1,4 +1,4 @@
-"""Several devices are compared with one, on the arenas that the scaling asks for."""
+"""Checks how many arenas a comparison of several devices with one uses, for each scaling."""
 
 import pytest
 from sentences import refusal

@@ -1,4 +1,4 @@
-"""What two engines come to on the same levels, by hand."""
+"""Tests the comparison of two engines on the same levels, worked out by hand."""
 
 from typing import Any
 
@@ -35,7 +35,7 @@ def test_engines_are_compared_level_by_level() -> None:
     found = engines.compare(c, mjx)
     assert found["same_targets"] == 0.75
     assert found["same_contacts"] == 0.75
-    assert found["same_time"] == 0.5  # one control step apart is the same
+    assert found["same_time"] == 0.5  # times one control step apart count as equal
     assert (found["levels_without_contact"], found["same_time_without_contact"]) == (0.5, 0.5)
     assert found["levels_that_differ"] == [5]
     assert found["largest_differences"] == pytest.approx(

@@ -1,4 +1,4 @@
-"""Campaigns of faults go on where they stopped, and say what came of each."""
+"""Checks that campaigns of faults resume where they stopped, and count the outcomes of trials."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_a_campaign_goes_on_where_it_stopped(tmp_path: Path) -> None:
     words = ["campaign=policies", f"out={out}"]
     assert faults.main([*words, "count=2"]) == 0
     with out.open("a") as file:
-        file.write('{"campaign": "policies", "tri')  # stopped while it wrote
+        file.write('{"campaign": "policies", "tri')  # the process was stopped while writing
     faults.main(words)
     assert _trials(out) == [0, 1, 2, 3]
     faults.main(words)
@@ -67,7 +67,7 @@ def test_damaged_policies_are_refused_or_right(
 ) -> None:
     damage = faults_policies.DAMAGE[kind]
     monkeypatch.setattr(faults_policies, "DAMAGE", {kind: damage})
-    monkeypatch.setattr(faults_policies, "MOST_SECONDS", 10.0)  # whoever else is at work
+    monkeypatch.setattr(faults_policies, "MOST_SECONDS", 10.0)  # the machine may be busy
     found = [faults_policies.trial(seed, tmp_path) for seed in range(5)]
     assert {row["outcome"] for row in found} <= {"refused", "accepted"}, found
 
@@ -75,7 +75,7 @@ def test_damaged_policies_are_refused_or_right(
 def test_fuzzed_inputs_run_or_are_refused(tmp_path: Path) -> None:
     found = []
     for seed in range(1, 40):
-        if seed % 10:  # no processes here
+        if seed % 10:  # every tenth trial would start a process
             folder = tmp_path / str(seed)
             folder.mkdir()
             found.append(faults_inputs.trial(seed, folder))

@@ -1,4 +1,4 @@
-"""The table of benchmarks.fidelity: some of its rows against hand-worked numbers, and its form."""
+"""Tests the table of benchmarks.fidelity: its form, and some rows worked out by hand."""
 
 import json
 import math
@@ -38,15 +38,16 @@ def test_the_rig_steps_as_the_judge_does(body: str) -> None:
 
 
 def test_mass_and_inertia_are_those_of_the_model(bench: Rig) -> None:
-    assert fidelity_body.mass(bench) == pytest.approx(0.16, abs=1e-12)  # float64's rounding
-    # 1.06e-4, the robot's setting; MuJoCo keeps it in float64.
+    assert fidelity_body.mass(bench) == pytest.approx(0.16, abs=1e-12)  # float64's rounding.
+    # The robot's setting is 1.06e-4 kg m^2, which MuJoCo keeps in float64.
     assert fidelity_body.yaw_inertia(bench) == pytest.approx(1.06e-4, rel=1e-9)
 
 
 def test_another_mass_is_measured() -> None:
     heavy = rig.load(RobotConfig(body="wheeled", mass=0.2))
-    assert fidelity_body.mass(heavy) == pytest.approx(0.2, abs=1e-12)  # float64's rounding
-    # (0.19 * 0.015 + 0.01 * 0.02) / 0.2, but for the 0.01 mm that it stands in the floor.
+    assert fidelity_body.mass(heavy) == pytest.approx(0.2, abs=1e-12)  # float64's rounding.
+    # The height is (0.19 * 0.015 + 0.01 * 0.02) / 0.2, less the 0.01 mm by which the robot stands
+    # in the floor.
     height = 0.01525 - 1e-5
     assert fidelity_body.centre(heavy)[2] == pytest.approx(height, abs=1e-9)
 
@@ -54,7 +55,8 @@ def test_another_mass_is_measured() -> None:
 @pytest.mark.parametrize("radius", [0.037, 0.040])
 def test_the_hull_is_felt_and_seen_at_its_radius(radius: float) -> None:
     bench = rig.load(RobotConfig(hull_radius=radius))
-    # Float32 holds the direction of the wall's face, 1e-7 of the 2.5 m along it.
+    # The direction of the wall's face is kept in float32, with an error of 1e-7 of the 2.5 m along
+    # the face.
     assert fidelity_body.contact_radius(bench) == pytest.approx(radius, abs=1e-6)
     seen = 0.2 - fidelity_body.cast(bench, (0.2, 0.0, 0.033), (-1, 0, 0))
     assert seen == pytest.approx(radius, abs=1e-9)  # float64's rounding
@@ -63,23 +65,23 @@ def test_the_hull_is_felt_and_seen_at_its_radius(radius: float) -> None:
 @pytest.mark.parametrize(
     ("command", "realised"),
     [
-        # Wheels at 2.168 and 10.332 rad/s, of which 6.28 remain: v = 0.01 (2.168 + 6.28),
-        # w = (6.28 - 2.168) 0.02 / 0.052.
+        # The wheels should turn at 2.168 and 10.332 rad/s, and the latter is clamped to 6.28 rad/s:
+        # v = 0.01 (2.168 + 6.28), w = (6.28 - 2.168) 0.02 / 0.052.
         ((0.125, 3.14), (0.08448, 1.58154)),
-        # 7.334 and 11.416: both at their limit.
+        # The wheels should turn at 7.334 and 11.416 rad/s, so both are clamped.
         ((0.1875, 1.57), (0.1256, 0.0)),
     ],
 )
 def test_a_clamped_command(
     bench: Rig, command: tuple[float, float], realised: tuple[float, float]
 ) -> None:
-    # 1e-3: creep of the wheeled body on the floor.
+    # The tolerance of 1e-3 is for the creep of the wheeled body on the floor.
     found = rig.steady(bench, *command)
     assert found == pytest.approx(realised, rel=1e-3, abs=1e-9)
 
 
 def test_speed_along_an_arc_is_not_that_of_its_chord() -> None:
-    # A quarter of a circle of radius 1 m in 2 control steps of 0.032 s.
+    # The robot drives a quarter of a circle of radius 1 m in 2 control steps of 0.032 s.
     angle = np.linspace(0.0, 0.5 * math.pi, 3)
     pose = np.stack([np.sin(angle), 1.0 - np.cos(angle), angle], axis=-1)
     track = rig.Track(pose, pose, pose, np.zeros(3))
@@ -90,14 +92,16 @@ def test_speed_along_an_arc_is_not_that_of_its_chord() -> None:
 
 def test_ten_revolutions_show_the_track(bench: Rig) -> None:
     share, track, drift = fidelity_motion.turned(bench, 0.057)
-    assert share == pytest.approx(0.052 / 0.057, rel=1e-3)  # creep on the floor
-    assert track == pytest.approx(0.057, rel=1e-3)  # likewise
-    assert drift < 1e-6  # nothing pushes it aside
+    # The tolerance of 1e-3 is for creep on the floor. Nothing pushes the robot aside.
+    assert share == pytest.approx(0.052 / 0.057, rel=1e-3)
+    assert track == pytest.approx(0.057, rel=1e-3)
+    assert drift < 1e-6
 
 
 def test_speed_above_which_no_turn_is_left() -> None:
-    # The slower wheel too is at its limit: (v - 3.14 * 0.026) / 0.02 = 6.28. The bisection stops
-    # at 1e-5, and takes turns below 1e-3 rad/s, 2.6e-5 m/s of the slower rim, for none.
+    # No turn is left once the slower wheel is also at its limit: (v - 3.14 * 0.026) / 0.02 = 6.28.
+    # The bisection stops at 1e-5 m/s. It counts turn rates below 1e-3 rad/s as no turn, which is
+    # 2.6e-5 m/s at the rim of the slower wheel.
     found = fidelity_motion.turning_ends(rig.load(RobotConfig()))
     assert found == pytest.approx(0.1256 + 0.08164, abs=6e-5)
 
@@ -106,38 +110,42 @@ def test_a_start_is_limited_by_friction() -> None:
     for friction in (1.0, 0.5):
         bench = rig.load(RobotConfig(friction=friction), timestep=1e-4)
         expected = 0.1256 / (friction * 9.81)
-        # One of the steps of 0.1 ms.
+        # The tolerance is one physics step of 0.1 ms.
         assert fidelity_motion.reach_time(bench, (0.25, 0.0)) == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_lagging_motor_follows_its_closed_form(bench: Rig) -> None:
-    assert fidelity_motion.lag_error(bench) < 2e-3  # creep of the wheeled body; the planar is exact
+    # The wheeled body creeps; the planar body is exact.
+    assert fidelity_motion.lag_error(bench) < 2e-3
 
 
 def test_a_skid_takes_its_share_of_a_push(wheeled: Rig) -> None:
     track = fidelity_motion.blocked(wheeled)
-    # The wall pushes 0.015 m above the floor, the skid carries 0.6 of that at 0.025 m, and the
-    # wheels pass on what is left: F = 1.5696 N - 0.6 F. 1 %: the mean of a robot that hops.
+    # The wall pushes with a force F at a height of 0.015 m, so the skid at 0.025 m carries 0.6 F.
+    # The wheels push with the weight that is left: F = 1.5696 N - 0.6 F. The tolerance of 1 % is
+    # for the mean force of a robot that hops.
     assert track.force[-100:].mean() == pytest.approx(0.981, rel=0.01)
 
 
 def test_pitch_before_a_skid_touches(wheeled: Rig) -> None:
-    # atan(0.0001 / 0.025); 0.01: the floor gives way by 1e-6 m under a load of 0.04 N.
+    # The pitch is atan(0.0001 / 0.025). The tolerance of 0.01 degrees is for the floor, which
+    # yields by 1e-6 m under a load of 0.04 N.
     assert fidelity_motion.pitch_play(wheeled) == pytest.approx(0.2292, abs=0.01)
 
 
 def test_rays_before_a_wall(bench: Rig) -> None:
     rays = fidelity_infrared.see(bench, 0.010)
-    # From x = 0.030 and 0.022 m to 0.047 m, along yaws of 0.30081 and 0.80081 rad; 1e-6 m: the
-    # direction of the wall's face in float32, 2.5 m long.
+    # The rays lead from x = 0.030 m and 0.022 m to 0.047 m, at yaws of 0.30081 and 0.80081 rad. The
+    # tolerance of 1e-6 m is for the direction of the wall's face, 2.5 m long, in float32.
     assert rays[0] == pytest.approx(0.017 / math.cos(0.30081), abs=1e-6)
     assert rays[1] == pytest.approx(0.025 / math.cos(0.80081), abs=1e-6)
-    assert rays[2] == pytest.approx(1.0 - 0.031, abs=1e-6)  # to the side, through its own wheel
+    # The third ray leads to the side, through the robot's own wheel.
+    assert rays[2] == pytest.approx(1.0 - 0.031, abs=1e-6)
 
 
 def test_where_a_falling_reading_passes_a_level() -> None:
     found = fidelity_infrared.falls_to(lambda distance: 100.0 - 1000.0 * distance, 60.0)
-    assert found == pytest.approx(0.04, abs=1e-7)  # where the bisection stops
+    assert found == pytest.approx(0.04, abs=1e-7)  # the bisection stops at this error
 
 
 def test_an_error_is_that_of_the_worse_body() -> None:
@@ -212,7 +220,7 @@ def test_the_page_gets_its_table_and_the_plots_it_shows(tmp_path: Path) -> None:
     assert fidelity.markdown(ROWS) in written
     drawn = {f"figures/{path.name}" for path in (tmp_path / "figures").iterdir()}
     assert drawn == set(re.findall(r"!\[.*?\]\((.*?)\)", written))
-    # What a repository should carry for one plot.
+    # A plot in the repository should be smaller than 80 kB.
     assert max((tmp_path / name).stat().st_size for name in drawn) < 80_000
 
 

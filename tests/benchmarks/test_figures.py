@@ -1,4 +1,4 @@
-"""Speeds are the steps that were made by the seconds that a stopped clock says they took."""
+"""Checks that speeds are the number of steps divided by the seconds that a fake clock shows."""
 
 import functools
 import time
@@ -27,17 +27,18 @@ from swarmjax.training.program import Program
 
 Line = dict[str, Any]
 
-# Of the tiny configuration, the last stage being of three robots; the rest is chosen here.
+# Sizes of the tiny configuration, whose last stage has three robots. The other numbers below are
+# chosen here.
 ARENAS, ROBOTS, ROLLOUT = 8, 3, 8
 SEEDS, SUBSTEPS = 2, 5
-CONTROL_STEPS = steps_per_second.CONTROL_STEPS["planar"]  # of a call of physics or environment
-CALLS = [100.0, 4.0, 2.0, 1.0, 2.0, 3.0]  # s; the first is not counted: the median is 2 s
-MEDIAN = 2.0  # s
+CONTROL_STEPS = steps_per_second.CONTROL_STEPS["planar"]  # Per call of physics or environment.
+CALLS = [100.0, 4.0, 2.0, 1.0, 2.0, 3.0]  # Seconds; the first call is not counted.
+MEDIAN = 2.0  # Seconds of a counted call.
 
 
 @pytest.fixture
 def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """A clock that stands still unless it is told how many seconds have passed."""
+    """Replaces the clock by one that stands still; returns a function that lets seconds pass."""
     now = [1000.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
@@ -60,7 +61,7 @@ def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
 
 
 class Calls(NamedTuple):
-    """What is timed in the place of a compiled program, and what it was called with."""
+    """Stand-ins for the compiled programs, and the arguments with which they were called."""
 
     prepared: Prepared
     arguments: list[Any]
@@ -68,7 +69,7 @@ class Calls(NamedTuple):
 
 @pytest.fixture
 def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
-    """All three programs only let time pass."""
+    """Returns stand-ins for all three programs that only let time pass."""
     taken: Iterator[float] = iter(CALLS)
     arguments = []
 
@@ -94,7 +95,7 @@ def calls(program: Program, pass_time: Callable[[float], None]) -> Calls:
 
 
 def _assert_speeds(line: Line, control_steps: int) -> None:
-    """Of a call that made so many control steps in every arena."""
+    """Checks the speeds of a call that made `control_steps` control steps in every arena."""
     arena_steps = SEEDS * ARENAS * control_steps
     assert line["arena_steps_per_s"] == arena_steps / MEDIAN
     assert line["robot_steps_per_s"] == arena_steps * ROBOTS / MEDIAN
@@ -120,7 +121,7 @@ def test_speeds_of_training_are_those_of_the_updates_that_were_asked_for(calls: 
 
 
 def _begun(program: Program) -> EnvState:
-    """All zeros, in the shapes of arenas that have just begun."""
+    """Returns arenas full of zeros, in the shapes of arenas that have just begun."""
     shapes = jax.eval_shape(
         functools.partial(loop.init, program, programs.schedule(program.config))
     )
@@ -131,7 +132,7 @@ def test_a_call_of_the_environment_makes_the_steps_that_are_counted(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def step(world: World, state: EnvState, action: Any) -> tuple[EnvState, TimeStep]:
-        """Does nothing but count."""
+        """Only counts the step in the clock."""
         nothing, no = jnp.zeros(ROBOTS), jnp.zeros(ROBOTS, bool)
         done = jnp.zeros((), bool)
         came = TimeStep(state.observation, nothing, no, no, no, done=done, sound=~done)
@@ -149,7 +150,7 @@ def test_a_call_of_the_physics_makes_the_steps_that_are_counted(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def step(_: physics.Physics, data: Any, *__: Any) -> Any:
-        """Does nothing but count."""
+        """Only counts the step in the positions."""
         return data.replace(qpos=data.qpos + 1.0)
 
     monkeypatch.setattr(physics, "step", step)
@@ -163,15 +164,15 @@ def test_a_call_of_the_physics_makes_the_steps_that_are_counted(
 def test_resets_fall_into_the_calls_that_are_timed(tiny_config: TrainConfig) -> None:
     prepared = steps_per_second.prepare(tiny_config)
     arenas = steps_per_second.settle(prepared)
-    # Ages that are spread evenly make each arena reset once in a step limit; the tiny one is
-    # shorter than the control steps of a call.
+    # Ages are spread evenly, so each arena resets once per step limit. The tiny step limit has
+    # fewer control steps than a call.
     assert tiny_config.task.step_limit < CONTROL_STEPS
     line = steps_per_second.time_environment(prepared, arenas)
     assert line["episodes_ended"] >= tiny_config.arenas
 
 
 class _State(NamedTuple):
-    """What the trainer asks of a state."""
+    """A state with only the field that the trainer reads."""
 
     update: jax.Array
 
@@ -185,7 +186,7 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
     blank = jax.eval_shape(train, schedule, state, np.int32(2))[1]
     metrics = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), blank)
     metrics["mix"] += 4
-    metrics["robots"] += 20  # over all arenas; two updates of two seeds
+    metrics["robots"] += 20  # over all arenas, in each of two updates of two seeds
     metrics["transitions"] += 100
 
     def call(_: Any, state: _State, n: np.int32) -> tuple[_State, dict]:

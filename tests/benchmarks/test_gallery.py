@@ -1,4 +1,4 @@
-"""Pictures of the gallery show things where they are."""
+"""Checks that pictures of the gallery show robots, targets and boxes where they are."""
 
 import numpy as np
 import pytest
@@ -22,9 +22,10 @@ _LEVEL = Level(
 
 
 def _at(image: Image.Image, x: float, y: float) -> tuple[int, int, int]:
-    """Reads the colour at a place in metres, y up: one of the above, if it is near one.
+    """Reads the colour at a place (m, y up), rounded to blue, black or white if close to one.
 
-    Scaling down rings by some of 255 shades beside an edge; the colours are 100 and more apart.
+    Scaling the image down changes colours beside an edge by a few of 255 shades. The three colours
+    are 100 or more shades apart.
     """
     found = _shade(image, x, y)
     near = [c for c in (BLUE, BLACK, WHITE) if max(np.abs(np.subtract(c, found))) < 30]

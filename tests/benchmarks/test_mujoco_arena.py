@@ -1,4 +1,4 @@
-"""One arena of MuJoCo C for other trainers: it is the judge's, and its rewards are the task's."""
+"""Checks that the MuJoCo C arena for other trainers matches the judge, and its rewards the task."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -56,10 +56,11 @@ def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
         start, end = (observation.to_target(x.pose, x.target, np)[0][0] for x in (before, after))
         active = ~before.outcome.arrived[0]
         begun = (after.outcome.contacts - before.outcome.contacts)[0]
-        rays = after.observation[0, :, INFRARED]  # ideal sensors show metres
+        rays = after.observation[0, :, INFRARED]  # ideal sensors give metres
         step = reward.Step(start, end, rays, 0.04, after.outcome.arrived[0] & active, begun)
         expected = np.where(active, reward.total(step, weights), 0.0)
-        # Here in float64, there in float32; a ray of exactly its range is rounded either way.
+        # The arena computes in float64, and the expected reward is in float32. A ray that is
+        # exactly as long as its range may be rounded either way.
         np.testing.assert_allclose(moved.reward, expected, rtol=0.0, atol=1e-6)
         touched, near = touched + begun.sum(), near + (rays < 0.04).any(axis=-1).sum()
         if moved.over:
@@ -82,6 +83,7 @@ def test_a_rule_of_arrival_that_it_does_not_know_is_refused(settings: EvaluateCo
 
 
 def test_returns_end_with_their_episodes() -> None:
-    # The first is 1 and half of the second, which ends; the last three go on, halved each time.
+    # An episode ends at the second reward, so the first return is 1 + 2 / 2. The last three rewards
+    # belong to the next episode, and each later reward is halved once per step.
     found = cpu_paper_way.discounted([1, 2, 3, 4, 5], [False, True, False, False, False], 0.5)
     np.testing.assert_array_equal(found, [2.0, 2.0, 6.25, 6.5, 5.0])

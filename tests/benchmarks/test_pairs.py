@@ -1,4 +1,4 @@
-"""What is said of two programs timed in turn, and the arms of the curriculum's cost."""
+"""Tests the statistics of two programs timed in turn, and the arms of `curriculum_cost`."""
 
 import math
 
@@ -10,13 +10,13 @@ from swarmjax.run.settings import load_train
 
 
 class Clock:
-    """Stands for an arm: takes a second longer at every call."""
+    """Stands in for an arm; each call takes 1 s per update longer than the call before."""
 
     def __init__(self, calls: list[str], name: str) -> None:
         self.calls, self.name, self.count = calls, name, 0
 
     def time(self, updates: int) -> float:
-        """Counts the call."""
+        """Counts the call and returns its seconds."""
         self.calls.append(self.name)
         self.count += 1
         return float(updates * self.count)
@@ -32,8 +32,9 @@ def test_which_comes_first_alternates_and_the_first_call_is_not_counted() -> Non
 
 @pytest.mark.parametrize(
     ("n", "rank"),
-    # The largest k for which fewer than k heads in n throws have at most 2.5 %: of 10 throws 0 or
-    # 1 heads have 11 / 1024 = 1.1 %, 0 to 2 have 5.5 %; of 20, 0 to 5 have 2.1 %; of 6, 0 1.6 %.
+    # The rank is the largest k for which fewer than k heads in n throws have a probability of at
+    # most 2.5 %. In 10 throws, 0 or 1 heads have 11 / 1024 = 1.1 %, and 0 to 2 heads have 5.5 %. In
+    # 20 throws, 0 to 5 heads have 2.1 %. In 6 throws, 0 heads have 1.6 %.
     [(6, 1), (10, 2), (20, 6)],
 )
 def test_interval_of_a_median(n: int, rank: int) -> None:
@@ -47,7 +48,8 @@ def test_an_interval_holds_the_median_as_often_as_it_says() -> None:
     for _ in range(400):
         _, low, high = pairs.median(random.exponential(size=20).tolist())
         held += low <= math.log(2) <= high
-    # It holds with 95.9 % (20 values, ranks 6 to 15); 4 sd of 400 draws are 4 %.
+    # The interval holds the median with a probability of 95.9 % (20 values, ranks 6 to 15). Over
+    # 400 draws, 4 sd of the share are 4 %.
     assert 0.919 <= held / 400 <= 0.999
 
 

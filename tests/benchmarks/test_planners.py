@@ -1,4 +1,4 @@
-"""Ways on the grid worked out by hand, and planners of navground that keep apart."""
+"""Tests paths on the grid worked out by hand, and that navground's planners keep robots apart."""
 
 import sys
 from pathlib import Path
@@ -16,14 +16,14 @@ PLATE = np.array([[0.0, 0.0, 0.0, 0.02, 0.3]])
 
 
 def test_clearance_is_the_distance_to_the_nearest_edge() -> None:
-    """Of a wall at 0.6 m, of the plate's face, of its corner, and inside of it."""
+    """The points are near a wall at 0.6 m, the plate's face, its corner, and inside the plate."""
     points = np.array([[0.5, 0.0], [0.12, 0.1], [0.05, 0.34], [0.01, 0.0]])
     found = way_points.clearance(points, 1.2, PLATE)
     assert found == pytest.approx([0.1, 0.1, 0.05, 0.0])
 
 
 def test_clearance_of_a_box_that_is_turned() -> None:
-    """By 90 degrees the plate lies along x, 0.3 m to each side."""
+    """After a turn by 90 degrees the plate lies along x and reaches 0.3 m to each side."""
     turned = np.array([[0.0, 0.0, np.pi / 2, 0.02, 0.3]])
     assert way_points.clearance(np.array([[0.2, 0.1]]), 1.2, turned) == pytest.approx([0.08])
 
@@ -35,9 +35,10 @@ def test_a_target_in_sight_is_its_own_way_point() -> None:
 
 
 def test_the_way_leads_round_the_plate_and_never_through_it() -> None:
-    """From (-0.2, 0) to (0.2, 0): round an end at y = 0.3, two legs of 0.361 m.
+    """The path from (-0.2, 0) to (0.2, 0) leads round an end of the plate at y = 0.3.
 
-    sqrt(0.2^2 + 0.3^2) = 0.361: at best 0.72 m, and with a detour for the hull less than 0.85 m.
+    Two legs of sqrt(0.2^2 + 0.3^2) = 0.361 m make at least 0.72 m. With a detour for the hull the
+    path is shorter than 0.85 m.
     """
     target, place = np.array([[0.2, 0.0]]), np.array([[-0.2, 0.0]])
     plan = way_points.plan(1.2, target, PLATE, HULL)
@@ -48,11 +49,11 @@ def test_the_way_leads_round_the_plate_and_never_through_it() -> None:
         least = min(least, way_points.clearance(place, 1.2, PLATE)[0])
         way += 0.01
     assert 0.72 < way < 0.85
-    assert least > HULL - way_points.CELL  # a line is looked at a cell at a time
+    assert least > HULL - way_points.CELL  # lines are tested one cell at a time
 
 
 def test_robots_without_a_way_have_a_way_point() -> None:
-    """A plate from wall to wall; where there is no way, a robot heads for the target itself."""
+    """A plate from wall to wall leaves no path, so the robot heads for the target itself."""
     wall = np.array([[0.0, 0.0, 0.0, 0.02, 0.7]])
     target = np.array([[0.3, 0.0]])
     plan = way_points.plan(1.2, target, wall, HULL)
@@ -61,7 +62,7 @@ def test_robots_without_a_way_have_a_way_point() -> None:
 
 
 def _reached(who: str, stage: str, episodes: int) -> dict[str, float]:
-    """Means of the measures."""
+    """Returns the mean of each measure."""
     words = [f"stage={stage}", f"episodes={episodes}", "workers=1", "seed=11"]
     (line,) = baselines.results([who], words)
     return {name: found["mean"] for name, found in line["measures"].items()}

@@ -1,4 +1,4 @@
-"""POGEMA's puzzles as arenas, and the search that tells which can be solved on the grid."""
+"""Tests POGEMA's puzzles as arenas, and the search for puzzles that are solvable on the grid."""
 
 import json
 import math
@@ -24,7 +24,7 @@ def _solve(rows: str, start: Sequence[Place], target: Sequence[Place]) -> int | 
 
 
 def _room(point: np.ndarray, level: Level) -> np.ndarray:
-    """Distances [P] of points [P, 2] from the nearest wall of a level, m; 0 within one."""
+    """Returns distances [P] of points [P, 2] from a level's nearest wall, m; 0 inside a wall."""
     box = level.obstacle[level.obstacle_present].astype(np.float64)
     outside = np.maximum(np.abs(point[:, None] - box[:, :2]) - box[:, 3:], 0.0)
     return np.minimum(
@@ -44,7 +44,7 @@ def test_there_are_16_layouts_of_5_by_5() -> None:
 
 
 def test_two_change_ends_of_a_corridor_by_its_bay() -> None:
-    """Each has 4 cells to go, and one of them 2 more, into the bay and out of it."""
+    """Each robot has 4 cells to go; one robot takes 2 more steps, into the bay and out of it."""
     assert _solve(".....\n##.##", [(0, 0), (0, 4)], [(0, 4), (0, 0)]) == 6
 
 
@@ -70,7 +70,7 @@ def test_a_cell_holds_one_robot() -> None:
 
 
 def test_a_robot_leaves_its_target_to_let_another_pass() -> None:
-    """It steps into the bay as the other takes its place, and back as that goes on."""
+    """The robot steps into the bay as the other takes its cell, and back as the other goes on."""
     assert _solve("...\n#.#", [(0, 0), (0, 1)], [(0, 2), (0, 1)]) == 2
 
 
@@ -87,7 +87,7 @@ def test_draws_are_of_distinct_free_cells_and_no_target_is_its_start(robots: int
 
 
 def test_a_target_is_drawn_where_its_start_leads() -> None:
-    """In two halves with a wall between, each robot stays in its own."""
+    """A wall divides the grid into two halves, and each target is in the half of its start."""
     rows = ("..#..",) * 5
     for number in range(30):
         draw = puzzles.draw_puzzle(number, rows, 3)
@@ -137,10 +137,10 @@ def test_two_robots_do_not_fit_side_by_side_in_a_cell() -> None:
 def test_in_a_bend_two_get_past_each_other_unless_cells_are_smaller(
     edge: float, passes: bool
 ) -> None:
-    """One waits in the outer corner of the bend at the origin; the other hugs the inner corner."""
+    """One robot waits in the outer corner of the bend; the other robot hugs the inner corner."""
     waiting = np.array([-1.0, 1.0]) * (edge / 2 - RADIUS)
     corner = np.array([1.0, -1.0]) * edge / 2
-    angle = np.linspace(np.pi / 2, np.pi, 1001)  # from the arm to the right into the one below
+    angle = np.linspace(np.pi / 2, np.pi, 1001)  # from the right arm into the lower arm
     way = corner + RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     apart = np.linalg.norm(way - waiting, axis=-1).min()
     assert apart == pytest.approx(math.sqrt(2) * (edge - RADIUS) - RADIUS)

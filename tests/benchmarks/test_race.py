@@ -1,4 +1,4 @@
-"""Brax is raced with the numbers that it is said to have, and judged by its own policy."""
+"""Checks the settings that Brax gets in the race, and that the judge runs Brax's policy."""
 
 import dataclasses
 
@@ -16,7 +16,8 @@ from tests.sentences import refusal
 
 def test_brax_is_given_our_numbers(tiny_config: TrainConfig) -> None:
     found = race.brax_settings(race.RaceConfig(points=4), tiny_config)
-    # 20 updates are judged every 5; 8 arenas of 3 robots, 8 control steps each.
+    # The budget has 20 updates, judged every 5 updates. An update has 8 arenas of 3 robots each,
+    # and 8 control steps.
     assert found["num_timesteps"] == 20 * 24 * 8
     assert (found["num_envs"], found["batch_size"], found["num_minibatches"]) == (24, 12, 2)
     assert (found["unroll_length"], found["num_updates_per_batch"]) == (8, 2)
@@ -28,7 +29,8 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
     words = race.RaceConfig(points=4, settings="playground")
     larger = dataclasses.replace(tiny_config, arenas=32, budget=32 * 8 * 20)
     found = race.brax_settings(words, larger)
-    # 20 updates of 8 control steps are 8 of 20, judged every 2; 32 arenas of 3 robots.
+    # 20 updates of 8 control steps are 8 updates of 20 control steps, judged every 2 updates. There
+    # are 32 arenas of 3 robots each.
     assert found["num_timesteps"] == 8 * 96 * 20
     assert (found["num_envs"], found["batch_size"], found["num_minibatches"]) == (96, 3, 32)
     assert (found["discounting"], found["learning_rate"]) == (0.97, 3e-4)
@@ -44,7 +46,7 @@ def test_brax_is_given_playgrounds_numbers(tiny_config: TrainConfig) -> None:
             "arenas is 40, which makes 200 robots: settings=playground needs a multiple of 32 "
             "robots.",
         ),
-        # 32 updates of 8 control steps are 12 of 20.
+        # 32 updates of 8 control steps are 12 updates of 20 control steps.
         (
             [
                 "trainer=brax",

@@ -1,4 +1,4 @@
-"""Every factor of realism has an arm of its own."""
+"""Checks that every factor of realism has its own arm."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ from benchmarks import realism_cost
 from swarmjax.config import ConfigError
 from swarmjax.sim.realism_config import COUNTED, RealismConfig
 
-NO_FACTOR = {"name", "stall_time", "hull_friction"}  # of `real`
+NO_FACTOR = {"name", "stall_time", "hull_friction"}  # entries of `real` without an arm
 NAMES = {item.name for item in dataclasses.fields(RealismConfig)} - NO_FACTOR
 
 

@@ -1,4 +1,4 @@
-"""The lab of sweeps: contacts worked out by hand, its twin of the solver, and what it refuses."""
+"""Tests `rub_sweeps`: contacts worked out by hand, its copy of the solver, and its refusals."""
 
 import functools
 from typing import Any
@@ -15,11 +15,11 @@ from swarmjax.sim.fast import discs, rubbing_jax, rubbing_warp
 from swarmjax.sim.fast.discs import DiscRobots, Discs, Rubbing
 
 ROBOTS, STATES, MOST = 5, 64, 400
-MOBILITY, AGILITY = 1.0 / 0.16, 1.0 / 1.06e-4  # 1 / kg, 1 / (kg m^2); an e-puck's
+MOBILITY, AGILITY = 1.0 / 0.16, 1.0 / 1.06e-4  # 1 / kg and 1 / (kg m^2) of an e-puck
 
 
 def _states(place: np.ndarray, free: np.ndarray, side: float) -> rub_sweeps.States:
-    """Robots [S, R, 3] of friction 1 at rest, in an arena without obstacles."""
+    """Returns states of robots [S, R, 3] at rest, with friction 1 and without obstacles."""
     count, robots, _ = place.shape
     size = model.ArenaSize(robots, 0, 0.05)
     built = model.build(RobotConfig(hull_friction=1.0), size, 0.032).compile()
@@ -39,7 +39,7 @@ def _states(place: np.ndarray, free: np.ndarray, side: float) -> rub_sweeps.Stat
 
 @pytest.fixture(scope="module")
 def jam() -> rub_sweeps.States:
-    """Five robots each in 0.25 m: all of them press others or walls."""
+    """Returns states of five robots in an arena of 0.25 m, where all press others or walls."""
     random = np.random.default_rng(7)
     place = random.uniform(-0.5, 0.5, (STATES, ROBOTS, 3)) * [0.25, 0.25, 6.0]
     free = random.normal(0.0, 3.0, (STATES, ROBOTS, 3)) * [1.0, 1.0, 20.0]
@@ -48,30 +48,31 @@ def jam() -> rub_sweeps.States:
 
 @pytest.fixture(scope="module")
 def at_rest(jam: rub_sweeps.States) -> np.ndarray:
-    """Its accelerations, converged in float64."""
+    """Returns the accelerations of the jam, converged in float64."""
     contacts = rub_sweeps.contacts_of(jam)
     return rub_sweeps.search(contacts, rub_sweeps.DESIGNS["plain"], 2000, np.float64, 1e-13)[0]
 
 
 def _off(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Of each state the worst number, as a share of its largest."""
+    """Returns each state's largest error, as a share of its largest expected number."""
     return np.abs(found - expected).max(axis=(1, 2)) / np.abs(expected).max(axis=(1, 2))
 
 
 def test_one_robot_against_a_wall_comes_to_rest_where_the_balance_of_forces_says() -> None:
-    # A millimetre within the east wall, where the impedance d is at its largest, 0.95, and driven
-    # into it with 2 m/s^2. The spring asks for k d depth away from the wall, k = 1 / (0.95 * 2
-    # dt)^2, and the force is (that + 2) / (1 / m + R), R = (1 - d) / d * weight, here 2 / 3 / m
-    # (the mean of three axes, of which one does not give way).
+    # The robot is a millimetre inside the east wall, where the impedance d has its maximum of 0.95,
+    # and is driven into the wall with 2 m/s^2. The spring demands the acceleration k d depth away
+    # from the wall, with k = 1 / (0.95 * 2 dt)^2. The force is (k d depth + 2) / (1 / m + R), with
+    # R = (1 - d) / d * weight. Here the weight is 2 / 3 / m, the mean over three axes, one of which
+    # cannot move.
     place, free = np.array([[[0.5 - 0.037 + 1e-3, 0.0, 0.0]]]), np.array([[[2.0, 0.0, 0.0]]])
     contacts = rub_sweeps.contacts_of(_states(place, free, 1.0))
     asked = 0.95 * 1e-3 / (0.95 * 0.064) ** 2
     give = 0.05 / 0.95 * 2.0 / 3.0
     expected = 2.0 - (asked + 2.0) / (1.0 + give)
     found, sweeps = rub_sweeps.search(contacts, rub_sweeps.DESIGNS["plain"], 400)
-    # The depth is a difference of numbers of 0.5 in float32: 3e-8 of 1e-3.
+    # The depth is a difference of float32 numbers near 0.5: it is off by 3e-8 of 1e-3.
     assert found[0, 0, 0] == pytest.approx(expected, rel=1e-4)
-    assert sweeps.tolist() == [2]  # one that finds it, one that sees no change
+    assert sweeps.tolist() == [2]  # the first sweep converges, the second sees no change
 
 
 @pytest.mark.parametrize("name", rub_sweeps.DESIGNS)
@@ -81,8 +82,8 @@ def test_all_designs_come_to_rest_in_one_place(
     contacts = rub_sweeps.contacts_of(jam)
     found, sweeps = rub_sweeps.search(contacts, rub_sweeps.DESIGNS[name], 2000)
     assert sweeps.max() < 2000
-    # A change of 1e-6 is the last of a row that may shrink by a few per cent a sweep only, and of
-    # forces that cancel.
+    # Sweeps end at a change of 1e-6. Their changes may shrink by only a few per cent per sweep, and
+    # forces may cancel, so the error is larger than that.
     assert _off(found, at_rest).max() < 1e-3
 
 
@@ -90,7 +91,8 @@ def test_the_solver_takes_as_many_sweeps_as_its_twin(jam: rub_sweeps.States) -> 
     contacts = rub_sweeps.contacts_of(jam)
     _, expected = rub_sweeps.search(contacts, rub_sweeps.DESIGNS["leaps-2"], MOST)
     _, found = rub_sweeps.built(jam)
-    # They round otherwise, and a leap multiplies that; the means are of 64 states.
+    # The solver and its copy round differently, and a leap multiplies the difference. The means are
+    # over 64 states.
     assert found.mean() == pytest.approx(expected.mean(), rel=0.1)
 
 
@@ -98,21 +100,23 @@ def test_the_solver_takes_as_many_sweeps_as_its_twin(jam: rub_sweeps.States) -> 
 def test_solvers_are_at_rest_where_plain_sweeps_are_far_from_it(
     solver: Any, jam: rub_sweeps.States, at_rest: np.ndarray
 ) -> None:
-    # Leaps are for the first half of the sweeps.
+    # Solvers leap only in the first half of the sweeps.
     few: Discs = jam.discs._replace(sweeps=120)
     solve = jax.jit(jax.vmap(functools.partial(solver.push_apart, few)))
     found = np.asarray(solve(jam.robots, jam.side, jam.obstacle))
     plain, _ = rub_sweeps.search(
         rub_sweeps.contacts_of(jam), rub_sweeps.DESIGNS["plain"], few.sweeps
     )
-    # 3e-5 was seen: changes of 1e-6, each the last of a row that shrinks slowly. Plain: 3.5e-3.
+    # The solvers' measured error is 3e-5, since they stop at changes of 1e-6 that shrink slowly.
+    # Plain sweeps have an error of 3.5e-3.
     assert _off(found, at_rest).max() < 1e-4
     assert _off(plain, at_rest).max() > 1e-3
 
 
 def test_hulls_that_are_grazed_at_speed_come_to_rest() -> None:
-    # Of 20,000 crowds those three that did not, where any change above 1e-6 of a push counted:
-    # their pushes are so small that accelerations of 100 m/s^2 round to more than that.
+    # These three of 20,000 crowds did not come to rest while any change above 1e-6 of a push
+    # counted. Their pushes are so small that the rounding of accelerations of 100 m/s^2 exceeds
+    # such a change.
     random, shape = np.random.default_rng(5), (20_000, ROBOTS, 3)
     rows, turn = [10062, 10658, 14805], [1.0, 1.0, 10.0]
     place = random.uniform(-0.5, 0.5, shape) * [0.6, 0.6, 6.0]

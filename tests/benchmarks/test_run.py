@@ -1,4 +1,4 @@
-"""Suites of benchmarks: what is left to run, what a process leaves behind, and the page."""
+"""Tests suites of benchmarks: the runs that are left, the results of processes, and the page."""
 
 import importlib.util
 import json
@@ -24,7 +24,7 @@ Script = Callable[[str], None]
 
 @pytest.fixture
 def script(monkeypatch: pytest.MonkeyPatch) -> Script:
-    """Puts a script in the place of benchmarks; `values` are those that it is asked for."""
+    """Returns a function that replaces benchmarks by a script; it gets the requested `values`."""
 
     def put(body: str) -> None:
         def command_line(entry: SuiteEntry, values: list[str]) -> list[str]:
@@ -100,7 +100,7 @@ def test_what_is_left_of_an_entry() -> None:
     assert run.left(ENTRY, [line(arenas=4) | {"entry": "other"}]) == ["8", "4", "2"]
     failed = [line(arenas=8), line(arenas="4", failed="it died")]
     assert run.left(ENTRY, failed) == ["4", "2"]
-    assert run.left(ENTRY, [*failed, line(arenas=4)]) == ["2"]  # a later result counts
+    assert run.left(ENTRY, [*failed, line(arenas=4)]) == ["2"]  # a later result replaces a failure
     assert run.left(ALONE, []) == [None]
     assert run.left(ALONE, [line(entry="a", skipped="no peer")]) == [None]
     assert run.left(ALONE, [line(entry="a")]) == []
@@ -207,7 +207,8 @@ def test_speeds_of_a_peer() -> None:
 def test_robots_share_the_floor_and_the_card() -> None:
     made = robots_speed.load(20, 1000, [])
     (stage,) = made.stage
-    # 1000 / 20 = 50 arenas, of which 64 are nearer than 32 by the logarithm; 1.2 m * sqrt(20 / 5).
+    # 1000 / 20 = 50 arenas are closer to 64 than to 32 by the logarithm. The side is
+    # 1.2 m * sqrt(20 / 5).
     assert (made.arenas, stage.robots, stage.side, made.sim.max_robots) == (64, 20, 2.4, 20)
     (stage,) = robots_speed.load(1, 1000, []).stage
     assert stage.side == 0.8
@@ -269,7 +270,7 @@ def test_tables() -> None:
         "| arenas | 256 | 1,024 | 4,096 |\n| --- | --: | --: | --: |\n"
         "| swarmjax, planar, warp | 1.5 M | 61.2 M | 1.23 G |\n| X | 999 |  |  |\n"
     ) in text
-    # 2048 bytes an arena are 2 KiB.
+    # 2048 bytes per arena are shown as 2 KiB.
     assert (
         "| swarmjax, planar, warp: environment | 4.2 s, 2 KiB | 4.2 s, 2 KiB | 4.2 s, 2 KiB |"
         in text
@@ -303,7 +304,8 @@ def test_trainers_and_seeds() -> None:
         for seed in range(3)
     ]
     text = run_tables.markdown(seeds)
-    # A seed that never came to 0.95 is slower than any that did: two of three make the median.
+    # A seed that never reached 0.95 counts as slower than all that did. Two of three seeds never
+    # reached it, so there is no median.
     row = "| swarmjax, planar, warp | 3 | 1.0 (0.0, 1.0, 2.0) | - (4.0, -, -) "
     assert f"{row}| 9.0 (9.0, 9.0, 9.0) | 0.960, 0.960, 0.960 |" in text
 

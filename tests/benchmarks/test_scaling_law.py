@@ -1,4 +1,4 @@
-"""The table of arenas and transitions: its points, and what it says of them."""
+"""Tests the table over numbers of arenas and transitions: its points and its comparisons."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def test_a_point_of_less_than_one_update_is_not_trained(tmp_path: Path) -> None:
 
 
 def _judged(config: ScalingConfig, point: Point, reached: list[list[float]]) -> None:
-    """Stores measures [seeds, levels], all alike."""
+    """Stores `reached` [seeds, levels] as the result of every measure."""
     for action in scaling_law.ACTIONS:
         place = scaling_law.judged_file(config, point, "s6", action)
         place.parent.mkdir(exist_ok=True)
@@ -44,7 +44,7 @@ def test_a_point_is_compared_with_the_next_smaller_ones_level_by_level(tmp_path:
     assert (small["all_reached"], large["all_reached"]) == (0.5, 0.75)
     assert large["all_reached_by_arenas"][0] == 0.25
     assert not [key for key in small if key.endswith(("by_arenas", "by_transitions"))]
-    assert "all_reached_by_transitions" not in large  # 10 transitions were not judged
+    assert "all_reached_by_transitions" not in large  # no point of 10 transitions was judged
 
 
 @pytest.mark.parametrize("cell", ["s6", "r10", "crowd_dense"])

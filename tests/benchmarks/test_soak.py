@@ -1,4 +1,4 @@
-"""What a soak sums up: medians and slopes of samples whose trend is known."""
+"""Checks the medians and slopes that `soak` computes from samples with a known trend."""
 
 import json
 import os
@@ -10,7 +10,10 @@ from benchmarks import soak
 
 
 def _rows(memory_slope: float) -> list[dict[str, float]]:
-    """An hour, a sample a minute; 500 arena steps a second, two processor seconds a second."""
+    """Returns an hour of samples, one per minute.
+
+    A second has 500 arena steps and takes two processor seconds.
+    """
     return [
         {
             "leg": 1,
@@ -27,7 +30,7 @@ def _rows(memory_slope: float) -> list[dict[str, float]]:
 
 def test_a_leak_is_a_slope_in_percent_an_hour() -> None:
     found = soak.sum_up(_rows(memory_slope=100.0))["memory_mb"]
-    # The first six samples are left out: the median is that of minute 33.
+    # The first six samples are left out, so the median is the sample of minute 33.
     assert found["median"] == pytest.approx(1055.0)
     assert found["slope"] == pytest.approx(100.0 * 100.0 / 1055.0)
 

@@ -1,4 +1,4 @@
-"""What transfers: intervals and paired differences, worked out by hand."""
+"""Tests the intervals and paired differences of `transfer`, worked out by hand."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,14 @@ from swarmjax.config import ConfigError
 
 
 def test_levels_are_drawn_for_all_seeds_alike() -> None:
-    # Two seeds that fail on the same half of 100 levels: their mean has the spread of 100 values
-    # of 0 or 1, not that of 200. Percentiles of a binomial of 100 and 1/2: 0.40 and 0.60.
+    # Two seeds fail on the same half of 100 levels. Their mean thus spreads like the mean of 100
+    # values of 0 or 1, not of 200 values. The percentiles of a binomial distribution with n = 100
+    # and p = 1/2 are 0.40 and 0.60.
     levels = np.tile([0.0, 1.0], 50)
     found = dict.fromkeys(transfer.MEASURES, np.stack([levels, levels]))
     low, high = transfer.summarize(found, found, found)["targets_reached_interval"]
-    # 2,000 resamples place a percentile to 0.05 * 2.7 / 45 = 0.003 at one sd, on steps of 0.01.
+    # With 2,000 resamples a percentile has an sd of 0.05 * 2.7 / 45 = 0.003, and means come in
+    # steps of 0.01.
     assert low == pytest.approx(0.40, abs=0.011)
     assert high == pytest.approx(0.60, abs=0.011)
 
@@ -25,7 +27,7 @@ def test_differences_are_paired_by_level() -> None:
     ideal = dict.fromkeys(transfer.MEASURES, levels - 0.5)
     result = transfer.summarize(found, first, ideal)
     for name in transfer.MEASURES:
-        # Every level loses a quarter, so the difference has no spread, and the mean has.
+        # Every level loses 0.25, so the difference has no spread, but the mean has.
         assert result[f"{name}_change"] == pytest.approx(-0.25)
         assert result[f"{name}_change_interval"] == pytest.approx((-0.25, -0.25))
         assert result[f"{name}_realism_change"] == pytest.approx(0.25)

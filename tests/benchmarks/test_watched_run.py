@@ -1,4 +1,4 @@
-"""A training run watched from the outside, with a script in the place of training."""
+"""Tests how a training run is watched from outside, with a script in place of training."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from benchmarks import command_to_success
 from benchmarks.watched_run import Watched
 from swarmjax.config import ConfigError
 
-# Writes a row of metrics with each of these successes, and ends where it is asked to.
+# The script writes a row of metrics for each success, and exits on SIGINT.
 SCRIPT = """#!{python}
 import json, os, signal, sys, time
 signal.signal(signal.SIGINT, lambda *_: sys.exit(130))
@@ -60,7 +60,7 @@ def test_what_was_never_reached_has_no_seconds(
 
 
 def test_a_run_is_asked_to_stop_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A second Ctrl-C ends a run before it has saved itself.
+    # A second Ctrl-C would end a run before it has saved its state.
     _put(tmp_path, monkeypatch, [0.97])
     watched, sent = Watched([], tmp_path / "run", {}), []
     with monkeypatch.context() as patched:
@@ -69,7 +69,7 @@ def test_a_run_is_asked_to_stop_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
         watched.stop()
     assert sent == [signal.SIGINT]
     watched._process.kill()
-    with pytest.raises(ConfigError):  # it did not end as one that was asked to
+    with pytest.raises(ConfigError):  # the run was killed, and did not stop as asked
         list(watched.rows())
 
 

@@ -1,4 +1,4 @@
-"""The study of curricula on worlds: its arms, its points, and its tables by hand."""
+"""Tests the study of curricula on worlds: arms, points, and tables worked out by hand."""
 
 import json
 from pathlib import Path
@@ -47,7 +47,7 @@ def test_only_the_arm_without_curriculum_has_the_sizes_that_are_judged() -> None
 
 
 def test_the_last_point_is_the_end() -> None:
-    words = ["budget=5e6", "arenas=8192"]  # 9 updates of 524,288 steps
+    words = ["budget=5e6", "arenas=8192"]  # 9 updates of 524,288 arena steps
     config = worlds_study.load_arm(Study(), "random", words)
     assert worlds_study.points(Study(points=3), config).tolist() == [3, 6, 9]
     assert refusal(worlds_study.points, Study(points=10), config) == (
@@ -84,7 +84,8 @@ def test_arms_are_compared() -> None:
     assert found[2] == (
         "| random | 0.40 [0.40, 0.40] | never | 0.00 [0.00, 0.00] | 0.25 [0.25, 0.25] | - |"
     )
-    # The mean over the families goes from 0.6 to 1.0, and is 0.9 at three quarters of the way.
+    # The mean over the families rises from 0.6 to 1.0, and passes 0.9 after three quarters of the
+    # steps between the two points.
     assert found[3] == (
         "| adaptive | 1.00 [1.00, 1.00] | 1.8e+02 | 1.00 [1.00, 1.00] | 0.25 [0.25, 0.25] "
         "| 1.00 [1.00, 1.00] |"

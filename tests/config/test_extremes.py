@@ -1,4 +1,4 @@
-"""Every number of every command is refused, or is one that float32 holds."""
+"""Checks that each number given to a command is either refused or representable in float32."""
 
 import dataclasses
 import json
@@ -37,7 +37,7 @@ COMMANDS: dict[type[Section], dict[str, Any]] = {
     SuiteFileConfig: {"name": "mine", "cells": [CELL]},
 }
 EXTREMES = [1e300, -1e300, 1e-300, -1e-300, 1e39, 1e-39, 2**31, 2**63, -(2**63), 10**5000]
-# What goes with a key that is an option of another one.
+# Each of these keys is valid only if another setting has the value given here.
 WITH = {
     "std_decrement": {"exploration": "scheduled"},
     "std_interval": {"exploration": "scheduled"},
@@ -56,7 +56,7 @@ KEYS = [(cls, key) for cls in COMMANDS for key, item in section.keys(cls).items(
 
 
 def _shapes(hint: Any, value: float) -> Iterator[Any]:
-    """Yield a number in each form that a key may take it in."""
+    """Yield a number in each form in which a key may accept it."""
     yield value
     if "tuple" in str(hint):
         yield from ([value], [value, value], [0.5, value], [[value, value]])
@@ -65,7 +65,7 @@ def _shapes(hint: Any, value: float) -> Iterator[Any]:
 
 
 def _nested(base: Any, path: list[str], value: Any) -> Any:
-    """Return plain data with one more key, in each of a list."""
+    """Return plain data with the value set at the path, in every item where there is a list."""
     if not path:
         return value
     if isinstance(base, list):
@@ -86,7 +86,7 @@ def _numbers(value: Any) -> Iterator[float]:
 
 
 def _check(cls: type[Section], key: str, value: Any) -> None:
-    """Hold a value to being refused in one sentence, or to being one that float32 holds."""
+    """Check that a value is either refused in one sentence or representable in float32."""
     try:
         made = build(cls, _nested(COMMANDS[cls], key.split("."), value))
     except ConfigError as error:
@@ -122,7 +122,7 @@ def test_any_number_is_refused_or_fits_float32(
         _check(cls, key, value)
 
 
-# Of these float32 alone bounds the size: each is a weight, a rate or a time that may be anything.
+# Only float32 bounds these keys: each is a weight, a rate or a time without a natural limit.
 UNBOUNDED = {
     *(f"algo.{key}" for key in section.keys(AlgoConfig)),
     *(f"curriculum.{key}" for key in section.keys(CurriculumConfig)),

@@ -1,4 +1,4 @@
-"""Words of a command line and files of configs/ become settings."""
+"""Tests how words of a command line and files of configs/ become settings."""
 
 import shutil
 from pathlib import Path
@@ -15,7 +15,7 @@ ROOT = Path(files.__file__).resolve().parents[2]
 
 @pytest.fixture
 def own_configs(tmp_path, monkeypatch):
-    """A copy of configs/ beside a project file, in which a test may write."""
+    """Returns a copy of configs/ beside a pyproject.toml; a test may write to the copy."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     (tmp_path / "pyproject.toml").touch()
     monkeypatch.setattr(files, "_PACKAGE", tmp_path / "swarmjax")
@@ -147,7 +147,7 @@ def test_an_unsound_stage_file_is_one_sentence(own_configs, text, part):
 def test_configs_of_an_installed_package(tmp_path, monkeypatch):
     package = tmp_path / "site-packages" / "swarmjax"
     shutil.copytree(ROOT / "configs", package / "configs")
-    # Another package's folder of that name, which must not be taken for ours.
+    # Another package's folder is also named configs, and must not be taken for ours.
     (tmp_path / "site-packages" / "configs").mkdir()
     monkeypatch.setattr(files, "_PACKAGE", package)
     assert load_train(["stage=s1"]).stage_name == "s1"

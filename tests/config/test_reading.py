@@ -1,4 +1,4 @@
-"""Files of a user's are read without trust: each of these is refused at once, in one sentence."""
+"""Tests that user files are not trusted: a harmful file is refused at once, in one sentence."""
 
 import json
 import os
@@ -24,7 +24,7 @@ BOMB = "\n".join(
         ("a: " + "[" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("[" * 100_000 + "]" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("a: " + "9" * 4900, "4300 digits"),
-        ("a: " + "9" * 5001, "more than 5000 letters"),
+        ("a: " + "9" * 5001, "more than 5000 characters"),
         ("a: 1\na: 2\n", "key 'a' is there twice"),
         ("{[1]: 2}", "unhashable"),
         ("a: !!python/object/apply:os.system [ls]", "could not determine a constructor"),

@@ -1,4 +1,4 @@
-"""The strict converter, and sections made by hand."""
+"""Tests the strict converter, and sections that a test constructs directly."""
 
 import dataclasses
 import json
@@ -106,7 +106,7 @@ def test_what_is_no_whole_number_is_refused(value):
 
 def test_a_whole_number_of_any_length_is_one_and_held_to_the_bounds():
     sentence = refusal(build, TrainConfig, {"stage": [STAGE], "arenas": 10**400})
-    # Written short: 77 characters of the number and an ellipsis.
+    # The sentence shortens the number to 77 characters and an ellipsis.
     assert sentence == f"arenas is 1{'0' * 76}...: give 1 to 1048576."
 
 
@@ -115,7 +115,7 @@ def test_what_is_no_number_is_refused(value):
     sentence = refusal(build, RewardConfig, {"progress": value}, "task.reward.")
     assert sentence.startswith("task.reward.progress is ")
     assert sentence.endswith(": give a number.")
-    # A number that no float can hold is no number here.
+    # An integer too large for a float is refused like a value that is no number.
     assert refusal(build, RewardConfig, {"progress": 10**400}).endswith(": give a number.")
 
 

@@ -1,4 +1,4 @@
-"""The curriculum's bookkeeping and its decisions under `sequential`, worked out by hand."""
+"""Checks the curriculum's counts and its decisions in mode `sequential` against values by hand."""
 
 import dataclasses
 import math
@@ -38,12 +38,12 @@ NOW, BEFORE = -1, -2  # the current cohort, and the one before
 
 
 class Episode(NamedTuple):
-    """Episodes that have ended: a negative cohort counts from the one that is current."""
+    """Ended episodes. A negative cohort counts back from the current cohort, which is -1."""
 
     cohort: int
     targets: int = 10
     reached: int = 10
-    stage: int | None = None  # the newest
+    stage: int | None = None  # None: the newest
     episodes: int = 1
     complete: int = 0
     contacts: tuple[int, int, int] = (0, 0, 0)
@@ -51,7 +51,7 @@ class Episode(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What one update decided."""
+    """The decision of one update."""
 
     reason: int
     judged: int
@@ -66,19 +66,22 @@ _jitted = jax.jit(curriculum.advance, static_argnums=(2, 3))
 
 
 def _config(base: TrainConfig, stages: int, **changes: object) -> TrainConfig:
-    """Stages of 16 steps at 8 steps an update: a cohort is two updates. 20 updates in all."""
+    """Returns a config with this many stages and 20 updates.
+
+    A step limit of 16 steps at 8 steps an update makes a cohort last two updates.
+    """
     chosen = tuple(StageConfig(name=f"s{i}", robots=1 + i % 3, side=0.8) for i in range(stages))
     return dataclasses.replace(base, stage=chosen, **changes)
 
 
 @pytest.fixture
 def schedule(tiny_config: TrainConfig) -> Schedule:
-    """Three stages, left after updates 5 and 10 at the latest."""
+    """Returns a schedule of three stages; two end after 5 and 10 updates at the latest."""
     return programs.schedule(_config(tiny_config, 3))
 
 
 def _late(schedule: Schedule) -> Schedule:
-    """The same without deadlines."""
+    """Returns the schedule without deadlines."""
     return schedule._replace(deadline=np.full(len(schedule.deadline), NEVER, np.int32))
 
 
@@ -117,7 +120,7 @@ def _run(
     first: int = 0,
     options: CurriculumConfig = OPTIONS,
 ) -> tuple[Curriculum, list[Row]]:
-    """Updates that each see some episodes end."""
+    """Runs updates, in each of which the given episodes end."""
     state, rows = _start(schedule, options), []
     for update, episodes in enumerate(seen, first):
         if episodes:
@@ -148,7 +151,7 @@ def _advance(
 def test_schedule(tiny_config: TrainConfig) -> None:
     found = programs.schedule(_config(tiny_config, 3, curriculum=OPTIONS))
     assert found.stages.robots.tolist() == [1, 2, 3]
-    # Half of 20 updates in two equal parts; the last stage has no end.
+    # Half of 20 updates is split into two equal parts; the last stage has no deadline.
     assert found.deadline.tolist() == [5, 10, NEVER]
     assert found.threshold == np.float32(0.8)
     assert found.demotion == -1
@@ -165,7 +168,7 @@ def test_schedule_rounds_up(tiny_config: TrainConfig) -> None:
         curriculum=CurriculumConfig(budget_share=0.4, threshold=0.5, demotion=0.25),
     )
     found = programs.schedule(config)
-    # 0.4 of 20 updates, 8, in three parts: 2.67, 5.33, 8.
+    # 0.4 of 20 updates is 8 updates, in three parts that end at 2.67, 5.33 and 8.
     assert found.deadline.tolist() == [3, 6, 8, NEVER]
     assert found.cohort_updates == 3  # 17 steps take more than two updates of 8
     assert (found.threshold, found.demotion) == (0.5, 0.25)
@@ -209,7 +212,7 @@ def test_start(
     assert not any(np.any(column) for column in (*state.current, *state.previous))
 
 
-# --- who begins where
+# --- the stages on which arenas begin
 
 
 def _weighed(schedule: Schedule, weights: list[float], cohort: int = 0) -> Curriculum:
@@ -226,15 +229,15 @@ def test_all_weight_on_one_stage(schedule: Schedule, stage: int) -> None:
 
 
 def test_assign_by_hand(schedule: Schedule) -> None:
-    # Points (a + u) / 3 with u = 0.618, 0.236, 0.854; ends of the stages at 0.2 and 0.5.
+    # The points are (a + u) / 3 with u = 0.618, 0.236 and 0.854; stages end at 0.2 and 0.5.
     for cohort, expected in ((1, [1, 2, 2]), (2, [0, 1, 2]), (3, [1, 2, 2])):
-        # 0.206, 0.539, 0.873; 0.079, 0.412, 0.745; 0.285, 0.618, 0.951.
+        # The points by cohort: 0.206, 0.539, 0.873; 0.079, 0.412, 0.745; 0.285, 0.618, 0.951.
         found = curriculum.assign(_weighed(schedule, [0.2, 0.3, 0.5], cohort), 3)
         assert found.tolist() == expected
 
 
 def test_a_point_on_the_border_is_of_the_stage_that_begins_there(schedule: Schedule) -> None:
-    # Points 0, 0.25, 0.5 and 0.75, exactly.
+    # The points are exactly 0, 0.25, 0.5 and 0.75.
     found = curriculum.assign(_weighed(schedule, [0.25, 0.5, 0.25]), 4)
     assert found.tolist() == [0, 1, 1, 2]
 
@@ -250,7 +253,8 @@ def test_a_point_that_rounds_to_one_is_of_the_last_stage_that_has_weight(
 def test_many_arenas_stay_on_their_stage(schedule: Schedule) -> None:
     weights = [0.2, 0.3, 0.5]
     found = [curriculum.assign(_weighed(schedule, weights, cohort), 1000) for cohort in range(20)]
-    # Of 1000 points a thousandth apart only those beside the two borders can come to another.
+    # The 1000 points are a thousandth apart, so only the points beside the two borders can change
+    # their stage.
     assert (np.ptp(found, axis=0) > 0).sum() <= 2
 
 
@@ -267,8 +271,8 @@ def test_the_share_of_arenas_is_the_weight(raw: list[float], arenas: int, cohort
     weights = np.array(raw, np.float32) / np.float32(sum(raw))
     state = _many(len(raw), weights, cohort)
     share = np.bincount(np.asarray(curriculum.assign(state, arenas)), minlength=len(raw)) / arenas
-    # Points of even distance on a circle: an arc holds its share of them, give or take one. 1e-5:
-    # the float32 sum of up to 48 weights.
+    # The points are evenly spaced on a circle, so an arc holds its share of them, plus or minus
+    # one. 1e-5: the float32 sum of up to 48 weights.
     assert (np.abs(share - weights) <= 1 / arenas + 1e-5).all()
     assert not share[weights == 0.0].any()
 
@@ -299,8 +303,9 @@ def test_few_arenas_come_round_to_every_stage() -> None:
     turns = np.zeros(36, int)
     for cohort in range(200):
         turns += np.bincount(assign(jnp.int32(cohort)), minlength=36)
-    # 2 * 200 / 36 = 11.1 turns each. Multiples of the golden ratio miss the length of an arc by
-    # fewer than 2 of 200 points (Weyl sequences of bounded type: at most of order log 200).
+    # Each stage gets 2 * 200 / 36 = 11.1 turns. With multiples of the golden ratio, the number of
+    # points in an arc is off by fewer than 2 of 200 points (Weyl sequences of bounded type: at most
+    # of order log 200).
     assert turns.min() >= 9
     assert turns.max() <= 13
 
@@ -326,12 +331,12 @@ def test_episodes_count_for_the_cohort_and_the_stage_in_which_they_began(
         reward=jnp.array([[0.5, 1.5, 9.0], [-2.0, 0.0, 9.0]]),
         broken=jnp.zeros((2, 3), jnp.int32),
     )
-    state = curriculum.count(curriculum.count(state, ended), ended)  # all of it twice
+    state = curriculum.count(curriculum.count(state, ended), ended)  # counted twice
     current = [column.tolist() for column in state.current]
-    # Contacts of the first arena in the first step: 0 + 1 + 2; in the second: 9 + 10 + 11.
+    # The first arena has 0 + 1 + 2 contacts in the first step, and 9 + 10 + 11 in the second.
     assert current == [[2, 0, 2], [4, 0, 8], [2, 0, 4], [0, 0, 0], [6, 0, 60], [1.0, 0.0, -4.0]]
     previous = [column.tolist() for column in state.previous]
-    # Contacts of the second arena in the first step: 3 + 4 + 5.
+    # The second arena has 3 + 4 + 5 contacts in the first step.
     assert previous == [[0, 0, 2], [0, 0, 6], [0, 0, 6], [0, 0, 2], [0, 0, 24], [0.0, 0.0, 3.0]]
 
 
@@ -351,7 +356,7 @@ def test_record_of_a_cohort(schedule: Schedule) -> None:
     np.testing.assert_allclose(record.complete, [1 / 4, np.nan, 1.0], rtol=1e-6)
     np.testing.assert_allclose(record.contacts, [5 / 10, np.nan, 0.0], rtol=1e-6)
     np.testing.assert_allclose(record.reward, [1.5 / 10, np.nan, 0.0], rtol=1e-6)
-    # Both means begin at 1/2, as if 20 trials had come out so, and 10 and 5 more.
+    # Both means begin at 1/2 with the weight of 20 trials, and 10 and 5 trials are added.
     fast = [0.5 + 10 / 30 * (0.6 - 0.5), np.nan, 0.5 + 5 / 25 * (1.0 - 0.5)]
     for mean in (record.fast, record.slow):
         np.testing.assert_allclose(mean, fast, rtol=1e-6)
@@ -374,15 +379,15 @@ def test_running_means(
         [],
     ]
     state, rows = _run(_late(schedule), seen, options=options)
-    # n = 20 trials move `fast` by 20 / 40, n = 5 by 5 / 25; `slow` by a fifth of that. The first
-    # verdict moves both from 1/2.
+    # 20 trials move `fast` by a share of 20 / 40, and 5 trials by 5 / 25; `slow` moves by a fifth
+    # of the share. The first verdict moves both from 1/2.
     begun, rate = (n / (n + 20) for n in trials)
     start = 0.5 + begun * (first - 0.5)
     fast = start + rate * (second - start)
     slow = start + rate / 5 * (second - start)
     np.testing.assert_allclose(state.record.fast[0], fast, rtol=1e-6)  # rounding of float32
     np.testing.assert_allclose(state.record.slow[0], slow, rtol=1e-6)
-    np.testing.assert_allclose(state.record.progress[0], abs(fast - slow), rtol=1e-5)  # likewise
+    np.testing.assert_allclose(state.record.progress[0], abs(fast - slow), rtol=1e-5)  # float32
     assert rows[3].success == np.float32(first)
     assert rows[5].success == np.float32(second)
 
@@ -394,11 +399,11 @@ def test_a_stage_without_episodes_keeps_its_record(schedule: Schedule) -> None:
     np.testing.assert_allclose(state.record.success, [0.7, 0.2, np.nan], rtol=1e-6)
 
 
-# --- when it is decided, under `sequential`
+# --- when mode `sequential` decides
 
 
 def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
-    # Cohort 0 begins in updates 0 and 1; the last of its episodes end in updates 2 and 3.
+    # Episodes of cohort 0 begin in updates 0 and 1; the last of them end in updates 2 and 3.
     _, rows = _run(_late(schedule), [PERFECT] * 4)
     assert [row.reason for row in rows] == [STAYED, STAYED, STAYED, BY_THRESHOLD]
     assert [row.stage for row in rows] == [0, 0, 0, 1]
@@ -410,7 +415,7 @@ def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
 
 @pytest.mark.parametrize(("reached", "reason"), [(8, BY_THRESHOLD), (7, STAYED)])
 def test_threshold(schedule: Schedule, reached: int, reason: int) -> None:
-    # 8 of 10 are the threshold itself.
+    # 8 of 10 targets are exactly the threshold.
     _, rows = _run(_late(schedule), [[Episode(NOW, 10, reached)], [], [], []])
     assert rows[3].reason == reason
     assert rows[3].success == np.float32(reached / 10)
@@ -418,7 +423,7 @@ def test_threshold(schedule: Schedule, reached: int, reason: int) -> None:
 
 @pytest.mark.parametrize(("complete", "reason"), [(4, BY_THRESHOLD), (3, STAYED)])
 def test_threshold_of_whole_episodes(schedule: Schedule, complete: int, reason: int) -> None:
-    """9 of 10 targets would do; 4 of 5 episodes are the threshold itself."""
+    """9 of 10 targets would be enough for promotion; 4 of 5 episodes are exactly the threshold."""
     seen = [[Episode(NOW, 10, 9, episodes=5, complete=complete)], [], [], []]
     _, rows = _run(_late(schedule), seen, options=CurriculumConfig(success="all"))
     assert rows[3].reason == reason
@@ -426,12 +431,13 @@ def test_threshold_of_whole_episodes(schedule: Schedule, complete: int, reason: 
 
 
 def test_late_episodes_of_a_cohort_count_for_it(schedule: Schedule) -> None:
-    # The lucky ones end first: 9 of 10 in update 0; then 0 of 10 in update 3, of cohort 0 too.
+    # Successful episodes of cohort 0 end first, with 9 of 10 targets in update 0. Other episodes
+    # of cohort 0 end in update 3, with 0 of 10 targets.
     seen = [[Episode(NOW, 10, 9)], [], [Episode(NOW, 50, 50)], [Episode(BEFORE, 10, 0)]]
     state, rows = _run(_late(schedule), seen)
     assert rows[3].reason == STAYED
     assert rows[3].success == np.float32(9 / 20)
-    # The next cohort, which saw 50 of 50, is judged a step limit later.
+    # The next cohort reached 50 of 50 targets and is judged one step limit later.
     assert (int(state.previous.targets[0]), int(state.previous.reached[0])) == (50, 50)
     _, rows = _run(_late(schedule), [*seen, [], []])
     assert [row.reason for row in rows[4:]] == [STAYED, BY_THRESHOLD]
@@ -439,9 +445,9 @@ def test_late_episodes_of_a_cohort_count_for_it(schedule: Schedule) -> None:
 
 
 def test_short_episodes_weigh_no_more_than_long_ones(schedule: Schedule) -> None:
-    """Five arenas succeed in an update each, five fail in two: 10 of 15 episodes of a cohort.
+    """Five arenas succeed in one update, and five fail in two: 10 of 15 episodes in a cohort.
 
-    Of those that end in the first update of a cohort all of the new ones are successes.
+    All episodes of a cohort that end in its first update are successes.
     """
     quick = [Episode(NOW, 5, 5)]
     both = [Episode(NOW, 5, 5), Episode(BEFORE, 5, 0)]
@@ -459,13 +465,14 @@ def test_a_cohort_without_episodes_decides_nothing(schedule: Schedule) -> None:
 
 
 def test_episodes_of_the_stage_that_was_left_decide_no_more(schedule: Schedule) -> None:
-    # Left in update 3, from cohort 1. Its perfect episodes go on ending for a step limit.
+    # The first stage is left in update 3, during cohort 1. For one step limit more, perfect
+    # episodes of this stage still end.
     old = [Episode(0, stage=0), Episode(1, stage=0)]
     state, rows = _run(_late(schedule), [PERFECT] * 4 + [old, old])
     assert rows[3].stage == 1
     assert math.isnan(rows[5].success)
-    assert state.record.success.tolist()[0] == 1.0  # but it stays known how the old stage went
-    # Nothing of the new stage is judged before two step limits of its own, and then only it.
+    assert state.record.success.tolist()[0] == 1.0  # the old stage keeps its record
+    # The new stage is judged only after two step limits, and only by its own episodes.
     new = [*old, Episode(NOW, 10, 3)]
     _, rows = _run(_late(schedule), [PERFECT] * 4 + [new] * 4)
     assert [row.reason for row in rows[4:]] == [STAYED] * 4
@@ -476,7 +483,7 @@ def test_episodes_of_the_stage_that_was_left_decide_no_more(schedule: Schedule) 
 
 def test_deadline(schedule: Schedule) -> None:
     _, rows = _run(schedule, [[]] * 12)
-    # After 5 and 10 updates, which are numbers 4 and 9.
+    # The deadlines come after 5 and 10 updates, which are updates number 4 and 9.
     expected = [BY_BUDGET if update in (4, 9) else STAYED for update in range(12)]
     assert [row.reason for row in rows] == expected
     assert [row.stage for row in rows] == [0] * 4 + [1] * 5 + [2] * 3
@@ -485,7 +492,8 @@ def test_deadline(schedule: Schedule) -> None:
 
 @pytest.mark.parametrize(
     ("deadline", "begins"),
-    # Cohorts of 2 updates: 6 and 9 leave room for them, 1 and 2 do not (2, then 4).
+    # A stage lasts at least a cohort of 2 updates: deadlines of 6 and 9 leave room for that, and
+    # deadlines of 1 and 2 become 2 and 4.
     [([6, 9], 9), ([1, 2], 4), ([5, 6], 7)],
 )
 def test_the_last_stage_begins_by_the_deadlines_at_the_latest(
@@ -501,7 +509,7 @@ def test_deadline_reports_what_was_measured(schedule: Schedule) -> None:
 
 
 def test_a_deadline_begins_a_cohort_at_once(schedule: Schedule) -> None:
-    """Cohort 2 is cut short in update 4, after one; its episodes end in cohort 3."""
+    """Cohort 2 ends early in update 4, after one update; its episodes end in cohort 3."""
     cut = [[], [], [], [], [Episode(NOW, 10, 4)], [Episode(BEFORE, 10, 1, stage=0)], []]
     state, rows = _run(schedule, cut)
     assert [row.cohort for row in rows] == [0, 1, 1, 2, 3, 3, 4]
@@ -526,7 +534,7 @@ def test_the_last_stage_stays(tiny_config: TrainConfig) -> None:
     schedule = programs.schedule(_config(tiny_config, 1))
     _, rows = _run(schedule, [PERFECT] * 8, first=1000)
     assert {(row.reason, row.stage) for row in rows} == {(STAYED, 0)}
-    assert [row.success for row in rows[3:]] == [1.0] * 5  # measured nevertheless
+    assert [row.success for row in rows[3:]] == [1.0] * 5  # still measured
 
 
 def test_the_most_robots_met_never_falls(schedule: Schedule) -> None:
@@ -534,7 +542,7 @@ def test_the_most_robots_met_never_falls(schedule: Schedule) -> None:
     numbers = _late(schedule)._replace(demotion=np.float32(0.5))
     bad = [Episode(NOW, 10, 0)]
     state, rows = _run(numbers, [PERFECT] * 4, options=options)
-    assert int(state.met) == 2  # of the second stage
+    assert int(state.met) == 2  # robots of the second stage
     state, rows = _run(numbers, [PERFECT] * 4 + [bad] * 4, options=options)
     assert [row.stage for row in rows] == [0] * 3 + [1] * 4 + [0]
     assert int(state.met) == 2

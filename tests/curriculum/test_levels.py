@@ -1,4 +1,4 @@
-"""The buffer of levels by itself: what is scored, chosen, kept and dropped, against NumPy."""
+"""Checks the buffer of levels against NumPy: scores, choices, and which levels are kept."""
 
 from dataclasses import replace
 from typing import Any
@@ -29,7 +29,10 @@ def _options(**given: float) -> LevelNumbers:
 
 
 def _plays(slot: Any, stage: Any, **given: Any) -> Play:
-    """Episodes that began and ended, each with one trial, on levels of one number, their order."""
+    """Returns episodes that began and ended, with one trial each.
+
+    Each level is one number: by default its place in the list.
+    """
     count = len(slot)
     found = {
         "begun": np.ones(count, bool),
@@ -46,7 +49,10 @@ def _plays(slot: Any, stage: Any, **given: Any) -> Play:
 
 
 def _filled(config: LevelsConfig, stages: int = 2) -> LevelBuffer:
-    """Twelve levels in two stages, six each, of one episode each, by success or loss."""
+    """Returns a buffer of twelve levels with one episode each, with various outcomes and losses.
+
+    With two stages, each stage has six levels.
+    """
     plays = _plays(
         [FRESH] * 12,
         np.arange(12) % stages,
@@ -58,7 +64,7 @@ def _filled(config: LevelsConfig, stages: int = 2) -> LevelBuffer:
 
 
 def _expected_learnability(successes: Any, episodes: int, usual: Any) -> np.ndarray:
-    """Mean of p (1 - p) over a beta distribution, as its mean less its second moment."""
+    """Returns the mean of p (1 - p) over a beta distribution: its mean less its second moment."""
     a, b = successes + 2 * usual, episodes - successes + 2 * (1 - usual)
     mean = a / (a + b)
     return mean - (mean**2 + a * b / ((a + b) ** 2 * (a + b + 1)))
@@ -67,7 +73,7 @@ def _expected_learnability(successes: Any, episodes: int, usual: Any) -> np.ndar
 def test_learnability_is_the_expected_p_times_1_minus_p_over_recorded_outcomes() -> None:
     random, usual = np.random.default_rng(1), np.array([0.2, 0.9], np.float32)
     buffer = levels.init(2, 12, 1)
-    # A level's first episode, then 15 more of each place, in the order of chance.
+    # Each level has a first episode and 15 more, with random outcomes.
     came = random.random((16, 12)) < np.linspace(0.0, 1.0, 12)
     at, stage = np.arange(12), np.repeat([0, 1], 6)
     for i, episode in enumerate(came):
@@ -78,7 +84,7 @@ def test_learnability_is_the_expected_p_times_1_minus_p_over_recorded_outcomes()
             LEARNABILITY,
             usual,
         )
-    numbers = np.asarray(buffer.numbers[..., 0]).ravel().astype(int)  # who stands where
+    numbers = np.asarray(buffer.numbers[..., 0]).ravel().astype(int)  # the level in each place
     assert sorted(numbers) == list(range(12))
     first = came[0][numbers]
     successes = first + came[1:].sum(axis=0)
@@ -108,7 +114,7 @@ def test_value_loss_is_the_mean_of_the_newest_update() -> None:
 def test_sixteen_episodes_are_remembered() -> None:
     buffer = levels.init(1, 1, 1)
     usual = np.array([0.5], np.float32)
-    # Forty failures, then 24 successes: (1 - 1/17)^24 of the failures are left.
+    # After forty failures and 24 successes, the failures keep a weight of (1 - 1/17)^24.
     for i, success in enumerate([0] * 40 + [1] * 24):
         plays = _plays([FRESH if i == 0 else 0], [0], successes=[success])
         buffer, _ = UPDATE(buffer, plays, LEARNABILITY, usual)
@@ -120,7 +126,7 @@ def test_sixteen_episodes_are_remembered() -> None:
 def _expected_probabilities(
     score: np.ndarray, age: np.ndarray, held: np.ndarray, temperature: float, staleness: float
 ) -> np.ndarray:
-    """Of one stage, by the equations of prioritised level replay."""
+    """Returns one stage's replay probabilities, by the equations of prioritised level replay."""
     places = np.flatnonzero(held)
     ranked = places[np.argsort(-score[places], kind="stable")]
     found = np.zeros(len(score))
@@ -201,7 +207,7 @@ def test_levels_are_chosen_as_often_as_they_are_likely() -> None:
     for row, share in ((0, 0.8), (1, 0.4)):  # half of the second stage's places are empty
         mine = found[np.asarray(stage) == row]
         replayed = mine[mine != FRESH]
-        # Four standard deviations of a share of 100,000.
+        # Four standard deviations of a share that is measured with 100,000 choices.
         assert abs(len(replayed) / len(mine) - share) < 4 * 0.5 / np.sqrt(len(mine))
         seen = np.bincount(replayed, minlength=12) / len(replayed)
         expected = np.asarray(levels.probabilities(buffer, options))[row]
@@ -216,7 +222,7 @@ def test_levels_are_chosen_as_often_as_they_are_likely() -> None:
     pick=st.sampled_from([0.0, 2.0**-24, 0.5, 1.0 - 2.0**-23, 1.0 - 2.0**-24]),
 )
 def test_no_empty_place_is_chosen(held: list[int], pick: float) -> None:
-    """At either end of the line too, where many stages leave few bits to a float32."""
+    """Tests picks at either end of 0..1 as well, where float32 has few bits for 45 stages."""
     there = np.arange(5) < np.array(held)[:, None]
     buffer = replace(
         levels.init(45, 225, 1),
@@ -245,7 +251,7 @@ def test_the_best_that_are_new_take_the_places_of_the_worst() -> None:
         mine = loss[(stage == row) & ended]
         expected = np.sort(np.concatenate([before[row], mine]))[-6:]
         np.testing.assert_array_equal(np.sort(after.score[row]), expected)
-        # Who stays keeps its place, so that episodes that are under way find it.
+        # A level that stays keeps its place, so that running episodes find it.
         stays = ~np.asarray(taken).reshape(2, 6)[row]
         np.testing.assert_array_equal(np.asarray(after.score[row])[stays], before[row][stays])
         new = np.asarray(after.numbers[row, :, 0])[~stays]
@@ -259,7 +265,7 @@ def test_what_has_not_ended_or_was_lost_counts_for_nothing() -> None:
     assert not np.asarray(taken).any()
     for name in ("episodes", "successes", "score"):
         np.testing.assert_array_equal(getattr(after, name), getattr(buffer, name), err_msg=name)
-    assert int(after.begun[0, 0]) == 1  # it began, though
+    assert int(after.begun[0, 0]) == 1  # the episode began all the same
 
 
 def test_a_place_that_was_taken_is_lost() -> None:
@@ -272,8 +278,8 @@ def _find(temperature: float, seed: int) -> tuple[int, float]:
     """Plays a thousand levels: one succeeds half of the time, the others never or always.
 
     Returns:
-      The level with the best score after 400 updates, and its share of what was replayed in the
-      last hundred.
+      The level with the best score after 400 updates, and the share of the learnable level in the
+      replays of the last hundred updates.
     """
     arenas, config = 64, LevelsConfig(mode="learnability", buffer=128)
     options, one = _options(temperature=temperature, staleness=0.1), 617
@@ -298,7 +304,7 @@ def _find(temperature: float, seed: int) -> tuple[int, float]:
 def test_the_one_learnable_level_among_a_thousand_is_found(seed: int) -> None:
     best, share = _find(1.0, seed)
     assert best == 617
-    # Drawn at random it would be one in a thousand.
+    # With random draws, the share would be one in a thousand.
     assert share > 0.1
 
 

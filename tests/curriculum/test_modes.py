@@ -1,4 +1,4 @@
-"""The modes: forced by hand, and against a plain reference on episodes of a real tiny run."""
+"""Checks the modes by hand, and against a plain reference on episodes of a real tiny run."""
 
 import functools
 import math
@@ -55,7 +55,7 @@ _advance = jax.jit(curriculum.advance, static_argnums=(2, 3))
 
 
 def _schedule(stages: int, **changes: Any) -> Schedule:
-    """Stages of 1, 2, .. robots, without deadlines."""
+    """Returns a schedule of stages with 1, 2, ... robots, without deadlines."""
     chosen = tuple(StageConfig(name=f"s{i}", robots=1 + i, side=1.0) for i in range(stages))
     config = TrainConfig(stage=chosen, sim=SimConfig(max_robots=9))
     numbers = programs.schedule(config)._replace(
@@ -102,8 +102,8 @@ def _choose(
         (1, 0.79, 1, STAYED),
         (1, 0.3, 1, STAYED),
         (1, 0.29, 0, BY_DEMOTION),
-        (0, 0.0, 0, STAYED),  # nothing before the first
-        (2, 1.0, 2, STAYED),  # nothing after the last
+        (0, 0.0, 0, STAYED),  # no stage before the first
+        (2, 1.0, 2, STAYED),  # no stage after the last
         (2, 0.0, 1, BY_DEMOTION),
     ],
 )
@@ -124,7 +124,7 @@ def test_nothing_is_demoted_unless_asked_for() -> None:
 
 @pytest.mark.parametrize(("deadline", "why"), [(101, STAYED), (102, BY_DEMOTION)])
 def test_no_way_back_to_a_stage_whose_deadline_is_past(deadline: int, why: int) -> None:
-    """After update 100, which is the 101st."""
+    """Decides after update number 100, which is the 101st update."""
     numbers = _schedule(3, deadline=np.array([deadline, 500, NEVER], np.int32))
     found = _choose(SEQUENTIAL, _state(1, 3), numbers, _verdict([1.0, 0.0, 1.0]), 100)
     assert int(found.reason) == why
@@ -133,10 +133,10 @@ def test_no_way_back_to_a_stage_whose_deadline_is_past(deadline: int, why: int) 
 @pytest.mark.parametrize(
     ("cohort", "over", "success", "why"),
     [
-        (5, False, 1.0, STAYED),  # right after a decision: not even the deadline counts
-        (5, True, 1.0, BY_BUDGET),  # a step limit later; the verdict is of the cohort before
+        (5, False, 1.0, STAYED),  # right after a decision, not even the deadline counts
+        (5, True, 1.0, BY_BUDGET),  # a step limit later, the verdict is still of the cohort before
         (6, False, 1.0, BY_BUDGET),
-        (6, True, 1.0, BY_THRESHOLD),  # the first cohort that began since
+        (6, True, 1.0, BY_THRESHOLD),  # the first cohort that began after the decision
         (6, True, 0.0, BY_BUDGET),  # the deadline of its own stage goes before demotion
     ],
 )
@@ -184,15 +184,15 @@ NAN = math.nan
 @pytest.mark.parametrize(
     ("options", "fast", "slow", "score"),
     [
-        # p (1 - p); a quarter for what is unknown.
+        # The score is p (1 - p), and a quarter for an unknown p.
         (ADAPTIVE, [0.9, 0.5, 0.2, NAN], [0.0] * 4, [0.09, 0.25, 0.16, 0.25]),
-        (ADAPTIVE, [1.0, 1.0, 0.0, 1.0], [0.0] * 4, [1.0] * 4),  # nothing to learn: evenly
+        (ADAPTIVE, [1.0, 1.0, 0.0, 1.0], [0.0] * 4, [1.0] * 4),  # nothing to learn: even weights
         (ADAPTIVE, [NAN] * 4, [NAN] * 4, [1.0] * 4),
-        # |fast - slow|; the most that is known for what is unknown.
+        # The score is |fast - slow|. An unknown stage gets the largest known score.
         (PROGRESS, [0.9, 0.5, 0.2, NAN], [0.8, 0.5, 0.5, NAN], [0.1, 0.0, 0.3, 0.3]),
         (PROGRESS, [0.9, 0.5, NAN, NAN], [0.9, 0.5, NAN, NAN], [1.0] * 4),
         (PROGRESS, [NAN] * 4, [NAN] * 4, [1.0] * 4),
-        # 1 - p; what is unknown has failed.
+        # The score is 1 - p, and an unknown stage counts as p = 0.
         (FAILURE, [0.9, 0.5, 0.0, NAN], [0.0] * 4, [0.1, 0.5, 1.0, 1.0]),
         (FAILURE, [1.0] * 4, [0.0] * 4, [1.0] * 4),
     ],
@@ -203,7 +203,7 @@ def test_adaptive_weighs_by_its_score(
     state = _known(_state(3, 4), fast, slow)
     found = _choose(options, state, _schedule(4), _verdict([0.5] * 4), 3)
     expected = 0.1 / 4 + 0.9 * np.array(score) / sum(score)
-    np.testing.assert_allclose(found.weights, expected, rtol=1e-5)  # float32, differences of it
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-5)  # differences in float32
     assert (int(found.stage), int(found.reason)) == (3, REWEIGHED)
 
 
@@ -215,7 +215,7 @@ def test_adaptive_weighs_by_its_score(
         (1, [0.8, 0.8, NAN, NAN], 3, 3, BY_THRESHOLD),
         (1, [0.5, 0.0, NAN, NAN], 48, 1, REWEIGHED),
         (1, [0.5, 0.0, NAN, NAN], 49, 3, BY_BUDGET),
-        (3, [0.1, 0.0, 0.5, 0.5], 50, 3, REWEIGHED),  # what is unlocked stays unlocked
+        (3, [0.1, 0.0, 0.5, 0.5], 50, 3, REWEIGHED),  # unlocked stages stay unlocked
     ],
 )
 def test_prerequisites_are_practised_alone_until_each_succeeds(
@@ -308,7 +308,7 @@ def test_weights_are_shares(fast: list[float], seed: int, floor: float, index: i
     numbers = _numbers(stages, floor)
     found = np.asarray(_choose(options, state, numbers, _verdict(fast), 3).weights)
     assert found.sum() == pytest.approx(1.0, abs=1e-5)  # float32 sum of 40
-    assert (found >= (floor / stages * (1 - 1e-6) if index > 1 else 0.0)).all()  # its rounding
+    assert (found >= (floor / stages * (1 - 1e-6) if index > 1 else 0.0)).all()  # float32
     assert (found <= 1.0 + 1e-6).all()
 
 
@@ -322,7 +322,7 @@ def _numbers(stages: int, floor: float) -> Schedule:
 
 
 def _blank(stages: int, stage: int) -> Curriculum:
-    """What a mode reads of a curriculum of any number of stages."""
+    """Returns a curriculum of any number of stages, with only the parts that a mode reads."""
     state = _state(0, 1)
     return replace(
         state,
@@ -352,7 +352,7 @@ class Reference:
         self.weights = self._weights()
 
     def update(self, ended: Ended, number: int) -> int:
-        """Takes an update in; returns why something was decided."""
+        """Counts the episodes of an update, and returns the reason of its decision."""
         over = np.asarray(ended.episodes) > 0
         columns = (ended.cohort, ended.stage, ended.targets, ended.reached, ended.all_reached)
         self.episodes += list(zip(*(np.asarray(c)[over].tolist() for c in columns), strict=True))
@@ -371,7 +371,7 @@ class Reference:
         return reason
 
     def _judge(self) -> dict[int, np.float32]:
-        """Success of the cohort before, by stage."""
+        """Returns the success of the previous cohort, by stage."""
         judged = {}
         for stage in range(self.stages):
             mine = [e for e in self.episodes if e[:2] == (self.cohort - 1, stage)]
@@ -431,7 +431,10 @@ Step = Callable[[jax.Array, Arena | None, jax.Array, jax.Array], tuple[Arena, En
 
 @pytest.fixture(scope="module")
 def step() -> Step:
-    """A rollout of 8 arenas whose robots wander so wildly that some meet their targets."""
+    """Returns a function that runs a rollout of 8 arenas.
+
+    The robots move so randomly that some reach their targets by chance.
+    """
     sizes = [(1, 0.4), (1, 0.5), (2, 0.5)]
     config = TrainConfig(
         stage=tuple(StageConfig(name=f"s{i}", robots=n, side=s) for i, (n, s) in enumerate(sizes)),
@@ -461,7 +464,7 @@ def step() -> Step:
     return run
 
 
-# So that chance, which brings an eighth of the robots there, decides now this and now that.
+# An eighth of the robots arrive by chance. With these deadlines, decisions have different reasons.
 EARLY, LATE = np.array([24, 90, NEVER], np.int32), np.array([60, 80, NEVER], np.int32)
 CASES = {
     "sequential": (SEQUENTIAL, {"deadline": EARLY}),
@@ -489,7 +492,7 @@ def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
         assert reference.update(ended, number) == why[-1]
         assert int(state.stage) == reference.stage
         assert (int(state.cohort), int(state.since)) == (reference.cohort, reference.since)
-        # Rounding of float32 in sums and quotients; the shares themselves decide exactly.
+        # float32 rounding in sums and quotients. The decisions above must agree exactly.
         np.testing.assert_allclose(state.weights, reference.weights, rtol=1e-5)
     decided = [reason for reason in why if reason != STAYED]
     assert len(decided) >= 4
@@ -499,7 +502,7 @@ def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), index=st.integers(0, 3))
 def test_no_decision_within_a_step_limit_of_the_last(seed: int, index: int) -> None:
-    """Whatever the episodes come to, and however soon the deadlines are."""
+    """Tests random results of episodes, and random early deadlines."""
     random = np.random.default_rng(seed)
     options = (SEQUENTIAL, MIXED, ADAPTIVE, PROGRESS)[index]
     soon = np.sort(random.integers(1, 30, 3)).astype(np.int32)
@@ -515,7 +518,7 @@ def test_no_decision_within_a_step_limit_of_the_last(seed: int, index: int) -> N
 
 
 def _seen(state: Curriculum, random: np.random.Generator) -> Curriculum:
-    """Adds any tallies."""
+    """Returns the state with random tallies."""
     targets = random.integers(0, 3, 4)
     drawn = {"targets": targets, "reached": random.integers(0, targets + 1), "episodes": targets}
     columns = {key: jnp.asarray(value, jnp.int32) for key, value in drawn.items()}

@@ -1,4 +1,4 @@
-"""The Python of the guides runs as it is written; an error names the page and the line."""
+"""Runs the Python code of the guides as written; an error names the page and the line."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ _BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
 def _blocks(page: str) -> list[tuple[int, str]]:
-    """Lists the blocks of a page, each with the number of lines above its code."""
+    """Lists the code blocks of a page, each with the number of lines above its code."""
     text = (_DOCS / page).read_text()
     return [(text.count("\n", 0, found.start(1)), found[1]) for found in _BLOCK.finditer(text)]
 

@@ -1,4 +1,4 @@
-"""README quotes no measurement that is not stored."""
+"""Checks that README quotes only measurements that are stored."""
 
 import json
 import re
@@ -11,14 +11,14 @@ import yaml
 _ROOT = Path(__file__).parents[2]
 _README = (_ROOT / "README.md").read_text()
 _QUOTED = yaml.safe_load((Path(__file__).parent / "quoted_figures.yaml").read_text())
-# What measurements look like: a share, a speed, a number of contacts, a number in a table's cell.
+# Matches a measurement: a share, a speed, a number of contacts, or a number in a table's cell.
 _MEASURED = re.compile(
     r"\d[\d.,]* ?(?:%|[MkG]\b)|\d[\d.,]* (?:contacts|seconds|times faster)|\| *\d[\d.,]* *(?=\|)"
 )
 
 
 def _number(value: str) -> float:
-    """Reads a value from the line that it names."""
+    """Reads the number that `value` names by file, line and keys."""
     place, keys, *factor = value.split()
     file, _, line = place.partition(":")
     lines = (_ROOT / "benchmarks" / "results" / file).read_text().splitlines()
@@ -29,7 +29,7 @@ def _number(value: str) -> float:
 
 
 def _keys(dotted: str) -> list[str]:
-    """Splits keys at dots, but for the dot of a number such as `seconds_to_0.90`."""
+    """Splits keys at dots, except at the dot of a number such as in `seconds_to_0.90`."""
     return re.split(r"(?<!_\d)\.", dotted)
 
 

@@ -1,4 +1,4 @@
-"""What the build of the site checks, and the notebook that comes of its first tutorial."""
+"""Tests the checks of the site's build, and the notebook made from its first tutorial."""
 
 import importlib.util
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ def _extension(name: str) -> ModuleType:
 
 @dataclass(frozen=True, kw_only=True)
 class _Silent(Section):
-    """A section of which one key is not explained."""
+    """A section with one key that has no explanation."""
 
     told: int = field(default=1, metadata=about("something"))
     silent: int = field(default=1, metadata=about(" "))

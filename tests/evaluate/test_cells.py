@@ -1,4 +1,4 @@
-"""Levels of suites: drawn alike everywhere, held to digests, written and read."""
+"""Checks that levels of suites are reproducible, match their digests, and can be saved."""
 
 import dataclasses
 import io
@@ -26,7 +26,7 @@ from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
 NAMES = files.choices("suites")
-# Suites of levels that others have too: to be compared with them level by level, or picked out.
+# These suites share levels with other suites, for comparison level by level or as a selection.
 REPEATED = {"shapes", "noise", "headline", "scaling"}
 
 
@@ -200,7 +200,7 @@ def test_damage_is_refused_or_harmless(
     except ConfigError as error:
         sentence = str(error)
         assert "\n" not in sentence
-    else:  # a byte that zip does not read, or a name in the description
+    else:  # the damage hit a byte that zip ignores, or a name in the description
         assert [cell.digest for cell in found.cells] == [cell.digest for cell in tiny.cells]
 
 
@@ -222,7 +222,7 @@ def test_pickles_are_not_opened(tmp_path: Path, tiny: Suite) -> None:
     assert not (tmp_path / "sprung").exists()
 
 
-# --- the suites that there are
+# --- the project's suites
 
 
 def test_the_suites_are_those_of_the_manual() -> None:
@@ -240,13 +240,13 @@ def test_a_suite_is_sound_and_its_first_levels_are_drawn(name: str) -> None:
         assert cell.digest is not None
         drawn = cells.draw_cell(_first(cell))
         assert (drawn.shape, drawn.realism) == (cell.shape, cell.realism)
-        # Of how many boxes an obstacle is put together; docs/evaluation.md says of which.
+        # An obstacle of a shape consists of this many boxes; docs/evaluation.md describes them.
         parts = {"box": 1, "bar": 1, "cross": 2, "ell": 2, "pillar": 4}[cell.shape]
         assert drawn.levels.obstacle.shape[1] == parts * cell.stage.obstacles
 
 
 def _first(cell: CellConfig) -> CellConfig:
-    """The same cell with two levels."""
+    """Returns the same cell with only its first two levels."""
     numbers = cell.episodes[:2] or (0, 1)
     return dataclasses.replace(cell, levels=2, episodes=numbers, digest=None)
 
@@ -267,7 +267,7 @@ def test_no_level_is_in_two_suites_but_where_it_is_meant() -> None:
     for name in sorted(NAMES, key=lambda name: name in REPEATED):
         for cell in read_suite(name).cells:
             key = (cell.seed, cell.stage.robots, cell.stage.obstacles)
-            # crowd_dense, on which nobody trains, is new in the suite `scaling`.
+            # The cell crowd_dense is new in the suite `scaling`; no policy trains on it.
             assert (key in found) == (name in REPEATED and cell.name != "crowd_dense")
             found.setdefault(key, name)
     seeds = {name: {cell.seed for cell in read_suite(name).cells} for name in NAMES}
@@ -285,7 +285,7 @@ def test_the_headline_is_of_cells_that_other_suites_have() -> None:
 def test_swarms_are_as_dense_as_the_last_stage() -> None:
     for cell in read_suite("swarm").cells:
         area = cell.stage.sides[0] ** 2
-        assert area / cell.stage.robots == pytest.approx(1.2**2 / 5, rel=2e-3)  # mm
+        assert area / cell.stage.robots == pytest.approx(1.2**2 / 5, rel=2e-3)  # in whole mm
         assert cell.stage.obstacles == round(0.6 * cell.stage.robots)
     assert [cell.stage.robots for cell in read_suite("swarm").cells] == [1, 4, 8, 10, 20, 50]
 

@@ -1,4 +1,4 @@
-"""Who is in a deadlock: robots that stand, but not those that stand where they were to go."""
+"""Checks which robots are in a deadlock: robots that stand still and have not arrived."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ STEP, STEPS = 0.1, 100  # s; control steps of an episode
 
 
 def _level(arrived: list[bool], still: list[int]) -> Outcome:
-    """One level of as many robots, in which nothing else happened."""
+    """Returns the outcome of one level, in which nothing else happened."""
     robots = len(arrived)
     none, kinds = np.zeros((1, robots)), np.zeros((1, robots, 3))
     return Outcome(
@@ -32,6 +32,6 @@ def test_a_robot_that_has_arrived_is_in_no_deadlock_however_long_it_stands() -> 
 
 
 def test_of_robots_that_stand_those_on_their_way_are_in_a_deadlock() -> None:
-    # Four stand for 8 s, longer than 5 s: one of them has not arrived.
+    # Four robots stand still for 8 s, which is longer than 5 s. One of them has not arrived.
     found = measures.per_level(_level([True, False, True, True], [80] * 4), STEP, STEPS)
     assert found["deadlocks"].tolist() == [0.25]

@@ -1,4 +1,4 @@
-"""The judge against hand-worked numbers, and against the training environment."""
+"""Tests the judge against numbers worked out by hand, and against the training environment."""
 
 import dataclasses
 import math
@@ -48,7 +48,7 @@ def _stage(
 
 def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any) -> Judge:
     path = steering.write(tmp_path / "policy.npz", drive)
-    robot = rest.pop("robot", RobotConfig())  # planar, whose motion is worked out by hand
+    robot = rest.pop("robot", RobotConfig())  # the planar body's motion is worked out by hand
     config = EvaluateConfig(policy=str(path), stage=stage, robot=robot, **rest)
     return engine_c.load(config, policy.load(path))
 
@@ -56,7 +56,7 @@ def _judge(tmp_path: Path, stage: StageConfig, drive: tuple = STEER, **rest: Any
 def _start(
     judge: Judge, pose: list, target: list | None = None, obstacle: list | None = None
 ) -> Arenas:
-    """Starts one arena by hand; without a target it lies far ahead, out of reach."""
+    """Starts one arena at given poses; a target that is not given lies far ahead, out of reach."""
     return engine_c.start(judge, [_level(judge, pose, target, obstacle)])
 
 
@@ -108,24 +108,26 @@ def test_a_step_needs_the_action_of_a_policy_that_remembers(kind: str, tmp_path:
 def test_a_robot_drives_straight_to_its_target_and_stays(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage())
     arenas = _start(judge, [[-0.1, 0.2, 0.0]], [[0.2, 0.2]])
-    # (0.3 - 0.05) / 0.0040192 = 62.2: it is within 0.05 m after 63 control steps.
+    # (0.3 - 0.05) / 0.0040192 = 62.2, so the robot is within 0.05 m after 63 control steps.
     steps = math.ceil((0.3 - 0.05) / STRIDE)
     assert steps == 63
     arenas = _run(judge, arenas, steps - 1)
     assert not arenas.outcome.arrived.any()
-    # Float32 rounds the action and the start: some 1e-7 of 0.25 m.
+    # Float32 rounds the action and the start, by about 1e-7 of 0.25 m.
     np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 62 * STRIDE, 0.2, 0.0], atol=1e-6)
     arenas = _run(judge, arenas, 20)
     assert arenas.outcome.arrival.tolist() == [[63]]
     assert arenas.outcome.moving.tolist() == [[63]]
-    # The command is zero from the step after the arrival on, and the servo stops within it.
+    # From the step after the arrival on the command is zero. The servo stops the robot within that
+    # step.
     np.testing.assert_allclose(_pose(arenas)[0, 0], [-0.1 + 63 * STRIDE, 0.2, 0.0], atol=1e-6)
 
 
 def test_a_robot_turns_by_its_turn_rate(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(), SPIN)
     arenas = _start(judge, [[0.1, 0.2, 0.5]], [[0.1, 0.4]])
-    # The first step takes 1.06e-4 * 3.14 / 0.032 = 0.0104 N m, less than the limit of 0.0408.
+    # The first step takes a torque of 1.06e-4 * 3.14 / 0.032 = 0.0104 N m, less than the limit of
+    # 0.0408 N m.
     turned = 10 * 3.14 * STEP
     arenas = _run(judge, arenas, 10)
     np.testing.assert_allclose(_pose(arenas)[0, 0], [0.1, 0.2, 0.5 + turned], atol=1e-6)
@@ -144,11 +146,11 @@ def test_a_robot_that_starts_at_its_target_arrives_with_the_first_step(tmp_path:
 @pytest.mark.parametrize(
     ("kind", "pose", "obstacle", "gap", "pace"),
     [
-        # Centres 0.2 m apart, head on; both drive.
+        # Two robots, whose centres are 0.2 m apart, drive towards each other.
         ("robot", [[-0.1, 0.0, 0.0], [0.1, 0.0, math.pi]], [], 0.2 - 2 * 0.037, 2 * STRIDE),
-        # The wall is at x = 0.5; robot 1 drives along the middle, meeting nothing.
+        # The wall is at x = 0.5 m; robot 1 meets nothing on its way.
         ("wall", [[0.35, 0.3, 0.0], [-0.4, -0.3, 0.0]], [], 0.5 - 0.35 - 0.037, STRIDE),
-        # A box of edge 0.1 at (0.2, 0), straight.
+        # A box with an edge of 0.1 m stands at (0.2, 0), parallel to the walls.
         (
             "obstacle",
             [[0.0, 0.0, 0.0], [-0.4, -0.3, 0.0]],
@@ -170,7 +172,7 @@ def test_a_push_is_one_contact_of_its_kind(
     expected = np.zeros((1, 2, 3), int)
     expected[0, : 2 if kind == "robot" else 1, gaps.KINDS.index(kind)] = 1
     np.testing.assert_array_equal(arenas.outcome.contacts, expected)
-    # It goes on pushing, which is no further contact.
+    # The robot goes on pushing, which counts as no further contact.
     np.testing.assert_array_equal(_run(judge, arenas, 40).outcome.contacts, expected)
 
 
@@ -186,8 +188,8 @@ def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> No
     arenas = _run(judge, arenas, 60)
     before = _pose(arenas)[0, 0, 0]
     arenas = _run(judge, arenas, 50)
-    # One servo holds SPEED and the other 0, both with gain m / dt: together SPEED / 2. Contact is
-    # soft, so the speed is still settling, and a tenth covers it.
+    # One servo demands SPEED and the other demands 0, both with gain m / dt, so both robots move at
+    # SPEED / 2. Contact is soft, so the speed is still settling, which a tenth covers.
     assert _pose(arenas)[0, 0, 0] - before == pytest.approx(50 * STRIDE / 2, rel=0.1)
     assert arenas.outcome.arrival.tolist() == [[1, 0]]
     assert arenas.outcome.moving.tolist() == [[1, 110]]
@@ -198,7 +200,7 @@ def test_an_arrived_robot_is_pushed_and_its_arrival_stands(tmp_path: Path) -> No
 def test_steps_with_infrared_are_those_of_robots_on_their_way(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=3), STAY)
     pose = [[0.45, 0.0, 0.0], [0.45, 0.3, 0.0], [0.0, 0.0, 0.0]]
-    # Sensors at x = 0.48 look at the wall from 0.02 / cos(17 degrees) m. Robot 1 has arrived.
+    # The front sensors at x = 0.48 m see the wall at 0.02 / cos(17 degrees) m. Robot 1 has arrived.
     arenas = _run(judge, _start(judge, pose, [[-0.4, 0.0], [0.45, 0.3], [-0.4, 0.0]]), 7)
     assert arenas.outcome.sensed.tolist() == [[7, 1, 0]]
     assert arenas.outcome.moving.tolist() == [[7, 1, 7]]
@@ -212,7 +214,7 @@ def test_a_control_step_is_that_many_steps_of_mujoco(tmp_path: Path) -> None:
     arenas = _run(judge, _start(judge, pose, obstacle=box), 50)
     data = engine_c.place(judge, judge.model, np.array(pose, np.float32), np.array(box, np.float32))
     data.ctrl = [SPEED, 0.0, 0.0] * 2
-    # Float32 rounds the policy's action, which contacts do not magnify here.
+    # Float32 rounds the policy's action, and contacts do not magnify this error here.
     mujoco.mj_step(judge.model, data, 150)
     np.testing.assert_allclose(_pose(arenas)[0], data.qpos.reshape(-1, 3), atol=1e-6)
     assert judge.model.opt.timestep == STEP / 3
@@ -234,14 +236,14 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
             for p, b in zip(pose, box, strict=True)
         ]
     )
-    assert np.abs(gap).min() > 1e-7  # float32 in the walls' quaternions moves them by 1e-8 m
+    assert np.abs(gap).min() > 1e-7  # float32 quaternions move the walls by 1e-8 m
     touching = engine_c.touching(judge, data)
     assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
     np.testing.assert_array_equal(touching, gap <= 0.0)
 
 
 def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
-    """Of arenas whose side is drawn: a robot 5 mm away sees it, one 1 mm inside touches it."""
+    """In arenas of random size, a robot 5 mm from a wall sees it, one 1 mm inside touches it."""
     judge = _judge(tmp_path, _stage(robots=1, side=(0.6, 1.4)))
     drawn = [engine_c.draw_level(judge.stage, judge.spacing, 1, i) for i in range(20)]
     sides = [level.side for level in drawn]
@@ -254,14 +256,14 @@ def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
         assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
         if gap > 0:
             nearest = arenas.observation[:, 0, INFRARED].min(axis=-1)
-            assert ((nearest > 0.005) & (nearest < 0.04)).all()  # in range, and in all the same
+            assert ((nearest > 0.005) & (nearest < 0.04)).all()  # all within range
             np.testing.assert_allclose(nearest, nearest[0], atol=1e-6)  # float32
 
 
 def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -> None:
     stage = _stage(robots=3, side=0.7, obstacles=1)
     judge = _judge(tmp_path, stage)
-    # An episode in which robots meet one another and the obstacle, and all arrive.
+    # In episode 65 robots touch one another and the obstacle, and all of them arrive.
     drawn = engine_c.draw_level(judge.stage, judge.spacing, 1, 65)
     arenas = engine_c.start(judge, [drawn])
     sim = SimConfig(impl="jax", max_robots=3, max_obstacles=1)
@@ -270,7 +272,8 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     seen = np.asarray(state.observation)
     state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
     step = jax.jit(lambda state, action: env.step(world, state, action))
-    # Float32 against double along the way; the paths hardly magnify it, contacts included.
+    # Training computes in float32 and the judge in double precision. The paths hardly magnify this
+    # difference, even with contacts.
     np.testing.assert_allclose(seen, arenas.observation[0], atol=1e-5)
     for _ in range(168):
         state, came = step(state, policy.act(judge.policy, np.asarray(seen)))
@@ -282,14 +285,14 @@ def test_the_judge_counts_what_the_training_environment_counts(tmp_path: Path) -
     np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
     np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
     np.testing.assert_array_equal(state.episode.moving, arenas.outcome.moving[0])
-    assert arenas.outcome.contacts.sum(axis=(0, 1))[:2].min() >= 2  # both kinds did occur
+    assert arenas.outcome.contacts.sum(axis=(0, 1))[:2].min() >= 2  # both kinds occurred
 
 
 # --- the same level in training
 
 
 class Engines(NamedTuple):
-    """The judge, and the training environment of the same words: one arena, compiled."""
+    """The judge, and one compiled arena of the training environment with the same settings."""
 
     judge: Judge
     world: World
@@ -303,7 +306,7 @@ class Engines(NamedTuple):
     ids="-".join,
 )
 def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Engines:
-    """As they come of the YAML files, with the same physics steps."""
+    """Returns both engines with the settings of the YAML files and equally long physics steps."""
     body, realism = request.param
     path = steering.write(tmp_path_factory.mktemp("engines") / "policy.npz")
     arena = ["stage=s6", "stage.robots=3", "stage.side=0.7", "stage.obstacles=1"]
@@ -323,12 +326,12 @@ def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def _draw(engines: Engines) -> Level:
-    """An episode in which robots meet one another and the obstacle."""
+    """Draws the level of an episode in which robots touch one another and the obstacle."""
     return engine_c.draw_level(engines.judge.stage, engines.judge.spacing, 1, 65)
 
 
 def _train(engines: Engines, drawn: Level, steps: int) -> tuple[list[EnvState], list[np.ndarray]]:
-    """Drives by the policy; returns states and observations [R, O], the first ones included."""
+    """Steps the training environment by the policy; returns all states and observations [R, O]."""
     states = [engines.reset(drawn)]
     seen = [np.asarray(states[0].observation)]
     for _ in range(steps):
@@ -346,18 +349,20 @@ def test_judge_and_training_see_the_same_and_count_the_same(engines: Engines) ->
     for theirs, mine in zip(states[0].factors, arenas.factors, strict=True):
         assert (theirs is None) == (mine is None)
         if theirs is not None and mine is not None:
-            # The rounding of low + u * (high - low), and of log and cos.
+            # The tolerance is for the rounding of low + u * (high - low), log and cos.
             np.testing.assert_allclose(theirs, mine[0], rtol=2e-6, atol=1e-6)
     touched = False
     for state, found in zip(states, seen, strict=True):
         off = np.abs(found - arenas.observation[0])
         off[:, BEARING] = np.minimum(off[:, BEARING], 2 * math.pi - off[:, BEARING])
         if touched:
-            # Two solvers push alike to about a millimetre; a robot that pushes slips and turns.
+            # The two solvers' pushes agree to about a millimetre; a robot that pushes slips and
+            # turns.
             assert off[:, DISTANCE].max() < 1e-3
         else:
-            # Float32 against double: 1e-7 m and, near a target, 1e-5 rad. Where speeds are
-            # quantised it may turn into 2 % of a wheel's for a step; in this episode it does not.
+            # Float32 differs from double precision by 1e-7 m and, near a target, by 1e-5 rad. If
+            # speeds are quantised, this may change a wheel's speed by 2 % for a step, but does not
+            # in this episode.
             assert off.max() < 5e-5
             np.testing.assert_array_equal(state.episode.sensed, arenas.outcome.sensed[0])
         np.testing.assert_array_equal(state.episode.contacts, arenas.outcome.contacts[0])
@@ -381,7 +386,8 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
     np.testing.assert_array_equal(first.observation[0], first.observation[1])
     for one, other in zip(first.data, second.data, strict=True):
         np.testing.assert_array_equal(one.qpos, other.qpos)
-    # What is random about it comes from its seed, and nothing else does.
+    # The level's seed determines all that is random, and nothing else: with `ideal` another seed
+    # changes nothing.
     other = drawn._replace(seed=drawn.seed ^ np.uint32(1))
     _, elsewhere = _train(engines, other, steps)
     judged = _run(engines.judge, engine_c.start(engines.judge, [other]), steps)
@@ -392,8 +398,8 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
 
 # --- one factor at a time
 
-# Two robots that push each other, one beside the east wall, one before an obstacle; they drive
-# gently to the left, whatever they see.
+# Two robots push each other, one stands beside the east wall, and one stands before an obstacle.
+# All drive in a gentle curve to the left, whatever they observe.
 CROWD = [[-0.038, 0.0, 0.0], [0.038, 0.0, 3.0], [0.45, 0.0, 1.0], [0.0, -0.3, 0.0]]
 BOX = [[0.11, -0.3, 0.0, 0.05, 0.05]]
 CURVE = ((0.4, 0.2), (0.0, 0.0), (0.0, 0.0))
@@ -403,7 +409,7 @@ BodyName = Literal["planar", "wheeled"]
 
 
 def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [T, R, 3] and observations [T + 1, R, O] of the crowd."""
+    """Drives the crowd; returns poses [T, R, 3] and observations [T + 1, R, O]."""
     stage, real = _stage(robots=4, obstacles=1), RealismConfig(infrared="real", **realism)
     judge = _judge(tmp_path, stage, CURVE, robot=RobotConfig(body=body), realism=real)
     arenas = _start(judge, CROWD, obstacle=BOX)
@@ -416,7 +422,7 @@ def _tour(tmp_path: Path, body: BodyName, **realism: Any) -> tuple[np.ndarray, n
 
 
 def _robots_apart(one: np.ndarray, other: np.ndarray, least: float = 0.0) -> list[int]:
-    """Robots of which anything [T, R, ...] differs by more than the least."""
+    """Returns the robots with any entry of [T, R, ...] that differs by more than `least`."""
     return np.flatnonzero((np.abs(one - other) > least).any(axis=(0, 2))).tolist()
 
 
@@ -442,14 +448,15 @@ def test_a_factor_of_the_drive_moves_the_robots_alone(
 ) -> None:
     path, seen = _tour(tmp_path, body)
     moved, felt = _tour(tmp_path, body, **{factor: value})
-    np.testing.assert_array_equal(seen[0], felt[0])  # before anything moves
-    # Robots of any mass drive alike until they push: grip grows with the mass.
+    np.testing.assert_array_equal(seen[0], felt[0])  # Before anything moves.
+    # Robots of any mass drive alike until they push, since their grip grows with their mass.
     assert _robots_apart(path, moved, 1e-5) == (PUSHING if factor == "mass" else ALL)  # m, rad
     if factor == "mass" and body == "planar":
-        # Servos for another mass: the ratio is rounded, 1e-16 of 1e-1 m twelve times.
+        # The servos are scaled by a ratio of masses, which is rounded: 1e-16 of 1e-1 m, twelve
+        # times.
         assert _robots_apart(path, moved, 1e-12) == PUSHING
     if factor == "stall":
-        # Float32 poses; and a wheeled robot's heading goes through a quaternion.
+        # Poses are float32, and a wheeled robot's heading is converted from a quaternion.
         np.testing.assert_allclose(moved, np.broadcast_to(CROWD, moved.shape), atol=1e-6)
 
 
@@ -479,7 +486,7 @@ def test_a_factor_of_the_sensors_changes_what_they_see_alone(
     if factor == "dead_sensor":
         np.testing.assert_array_equal(felt[..., INFRARED], np.float32(0.04))
     if factor.startswith("reflectance"):
-        # What is darker seems further away.
+        # Darker surfaces seem further away.
         assert (felt[..., INFRARED] >= seen[..., INFRARED]).all()
 
 
@@ -516,7 +523,7 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
     )
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=2), realism=real)
     levels = [engine_c.draw_level(judge.stage, judge.spacing, 1, n) for n in range(200)]
-    # Closer together than they would ever start.
+    # The robots stand closer together than any level places them.
     levels = [drawn._replace(start=drawn.start * np.float32([1.0, 0.7, 1.0])) for drawn in levels]
     arenas = engine_c.start(judge, levels)
     pose, side, box = (
@@ -528,9 +535,11 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
     assert shades is not None
     assert sight.reflectance is not None
     ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, None, np)
-    # Of what overlaps its origin a ray of MuJoCo's does not say which it is.
+    # If several things overlap a ray's origin, MuJoCo does not tell which one the ray hits. Such
+    # rays are left out.
     apart = (ray > 0.0) & (sight.ray > 0.0) & (ray < 0.1)
-    # 1e-6 m: float32 in the walls' quaternions. The shades are numbers of a table.
+    # The tolerance of 1e-6 m is for float32 in the walls' quaternions. Shades come from a table, so
+    # they are exactly equal.
     np.testing.assert_allclose(sight.ray[apart], ray[apart], atol=1e-6)
     np.testing.assert_array_equal(sight.reflectance[apart], bright[apart])
     for each in shades:
@@ -562,7 +571,7 @@ def test_each_arena_has_robots_of_its_own(tmp_path: Path, body: BodyName) -> Non
 def test_an_episode_does_not_depend_on_those_beside_it(tmp_path: Path) -> None:
     judge = _judge(tmp_path, _stage(robots=3, side=0.7, obstacles=1), steps=150)
     together = engine_c.simulate(judge, _draw_some(judge, range(8)))
-    assert len(set(together.clock.tolist())) > 2  # arenas leave at different times
+    assert len(set(together.clock.tolist())) > 2  # arenas end at different times
     for episode in (0, 5, 7):
         alone = engine_c.simulate(judge, _draw_some(judge, [episode]))
         for one, all_ in zip(alone, together, strict=True):
@@ -586,11 +595,12 @@ def test_seed_and_number_alone_decide_the_level(tmp_path: Path) -> None:
 def test_obstacles_of_a_fixed_level_have_their_own_sizes(tmp_path: Path, layout: Any) -> None:
     stage = _stage(robots=1, side=1.4, obstacles=1, level="fixed", layout=layout)
     judge = _judge(tmp_path, stage)
-    # Boxes of 0.10 m; a fence of 0.50 by 0.06 m in a 0.7 m arena, its length scaled with the side.
+    # A box has an edge of 0.10 m. A fence has 0.50 by 0.06 m in an arena of 0.7 m, and its length
+    # scales with the side.
     half = [0.05, 0.05] if layout == "boxes" else [0.50, 0.03]
     found = judge.model.geom("obstacle0_box")
-    np.testing.assert_allclose(found.size[:2], half, rtol=1e-6)  # float32
-    # A bound that is left too small hides contacts at the ends from MuJoCo.
+    np.testing.assert_allclose(found.size[:2], half, rtol=1e-6)  # Float32.
+    # With a bound that is too small, MuJoCo would miss contacts at the ends.
     assert found.rbound[0] == pytest.approx(math.hypot(*half, 0.05), rel=1e-6)
 
 
@@ -607,7 +617,7 @@ def test_the_policy_says_how_fast_it_may_ask_for(tmp_path: Path) -> None:
 def test_physics_that_breaks_down_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log here
     judge = _judge(tmp_path, _stage(robots=2))
     arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     arenas.data[0].qvel[3] = np.nan
@@ -626,7 +636,7 @@ def test_a_policy_of_three_judges_three(tmp_path: Path) -> None:
 
 
 def test_robots_draw_their_actions(tmp_path: Path) -> None:
-    """A command is that of the mean plus the deviation times numbers that level and clock give."""
+    """An action is the mean plus the deviation times noise that level and clock determine."""
     judge = _judge(tmp_path, _stage(robots=2))
     learned = judge.policy._replace(log_std=np.log(np.array([[0.2, 0.1]], np.float32)))
     poses = [[-0.2, 0.0, 0.3], [0.2, 0.0, -1.0]]
@@ -639,7 +649,8 @@ def test_robots_draw_their_actions(tmp_path: Path) -> None:
     speed, turn = np.clip(action, -1, 1).transpose(2, 0, 1)
     wanted = [(speed + 1) / 2 * 0.1256, 3.14 * turn]  # m/s, rad/s
     told = np.stack([data.ctrl.reshape(2, 3) for data in arenas.data])[..., [0, 2]]
-    # Wheel by wheel clipped at 6.28 rad/s: those that are not keep what was wanted, in float32.
+    # Each wheel is clipped at 6.28 rad/s. Robots without a clipped wheel keep the wanted command,
+    # up to float32.
     free = np.abs(wanted[0]) + np.abs(wanted[1]) * 0.026 < 6.28 * 0.02
     assert 1 < free.sum() < 4
     for found, expected in zip(told[free].T, (x[free] for x in wanted), strict=True):
@@ -661,11 +672,11 @@ def test_what_is_drawn_does_not_depend_on_who_is_judged_beside(tmp_path: Path) -
     assert (engine_c.simulate(mean, levels).path != together.path).all()
 
 
-# --- what episodes come to
+# --- outcomes of episodes
 
 
 def test_contacts_last_and_push_as_servos_do(tmp_path: Path) -> None:
-    """A planar robot before a wall, and two head on: each servo pushes with m v / dt."""
+    """One planar robot pushes a wall and two push each other; each servo pushes with m v / dt."""
     judge = _judge(tmp_path, _stage(robots=3), AHEAD)
     pose = [[0.5 - 0.038, 0.3, 0.0], [-0.038, 0.0, 0.0], [0.038, 0.0, math.pi]]
     arenas = _run(judge, _start(judge, pose), 60)
@@ -683,10 +694,11 @@ def test_contacts_last_and_push_as_servos_do(tmp_path: Path) -> None:
 
 
 def test_friction_leaves_the_push_of_a_blocked_robot_as_it_is(tmp_path: Path) -> None:
-    """At an angle a to the wall's normal servos press with m v cos a / dt, however it slides.
+    """At an angle a to a wall's normal, a robot's servos push the wall with m v cos a / dt.
 
-    That is for a robot that does not turn: along the wall it moves at s, which its servos feel
-    with s sin a along its heading and s cos a across, and towards the wall both cancel.
+    The push does not depend on how fast the robot slides, as long as the robot does not turn. The
+    robot slides along the wall at speed s. Its servos brake s sin a along the heading and s cos a
+    across the heading, and the parts of these two forces towards the wall cancel.
     """
     for friction in (0.0, 0.3, 1.0):
         robot = RobotConfig(body="planar", hull_friction=friction, yaw_inertia=10.0)
@@ -696,7 +708,8 @@ def test_friction_leaves_the_push_of_a_blocked_robot_as_it_is(tmp_path: Path) ->
         before = arenas.outcome
         arenas = _run(judge, arenas, 20)
         impulse = (arenas.outcome.impulse - before.impulse)[0, 0, gaps.KINDS.index("wall")]
-        # Without friction it is flung no further than it sinks; 60 steps settle to 1e-3.
+        # Without friction the robot is thrown back no further than it sinks in. In 60 steps the
+        # robot settles to 1e-3.
         assert impulse == pytest.approx(20 * 0.16 * SPEED * math.cos(angle), rel=2e-3)
 
 
@@ -728,11 +741,11 @@ def test_impulses_are_of_normal_forces(tmp_path: Path, body: BodyName) -> None:
         assert push == pytest.approx(force[0], rel=1e-12)
         if judge.geom_robot[data.contact.geom[i]].max() >= 0:
             rubs = max(rubs, float(np.abs(force[1:3]).max()))
-    assert rubs > 0.01  # N; what hulls rub with is another number
+    assert rubs > 0.01  # N; hulls also have friction forces, which impulses leave out
 
 
 def test_a_stop_takes_the_momentum(tmp_path: Path) -> None:
-    """In the step of an impact a servo at its speed does not push: the wall alone slows it."""
+    """In the step of an impact a servo at its set speed does not push; only the wall slows it."""
     judge = _judge(tmp_path, _stage(), AHEAD)
     arenas = _start(judge, [[0.5 - 0.037 - 5.5 * STRIDE, 0.0, 0.0]])
     arenas = _run(judge, arenas, 6)
@@ -742,18 +755,18 @@ def test_a_stop_takes_the_momentum(tmp_path: Path) -> None:
     arenas = _run(judge, arenas, 1)
     after = float(arenas.data[0].qvel[0])
     impulse = arenas.outcome.impulse[0, 0, gaps.KINDS.index("wall")]
-    # The servo pushes by what float32 commands differ, some 1e-7 of m v.
+    # The servo pushes only by the rounding of its float32 command, about 1e-7 of m v.
     assert impulse == pytest.approx(0.16 * (before - after), rel=1e-5)
-    assert 0.0 > after > -0.2 * SPEED  # it bounces a little
+    assert 0.0 > after > -0.2 * SPEED  # the robot bounces a little
 
 
 def test_a_contact_without_overlap_has_no_force(tmp_path: Path) -> None:
-    """MuJoCo lists hulls just 0 m apart without solving for them: they have no row of forces."""
+    """MuJoCo lists a contact of hulls exactly 0 m apart, but solves no row of forces for it."""
     for row in ([[0.0, 0.0], [0.074, 0.0]], [[0.0, 0.0], [0.074, 0.0], [-0.07, 0.0]]):
         judge = _judge(tmp_path, _stage(robots=len(row)), STAY)
         pose = np.array([[*place, 0.0] for place in row])
         arenas = _start(judge, pose.tolist())
-        # In double precision, in which 0.074 is twice the hull's radius.
+        # The poses are set in double precision, in which 0.074 is exactly twice the hull's radius.
         arenas.data[0] = engine_c.place(judge, judge.model, pose, np.zeros((0, 5)))
         contact = arenas.data[0].contact
         assert contact.dist[0] == 0.0
@@ -761,7 +774,7 @@ def test_a_contact_without_overlap_has_no_force(tmp_path: Path) -> None:
         pushed = engine_c.step(judge, arenas).outcome.impulse[0, :, gaps.KINDS.index("robot")]
         if len(row) == 2:
             assert not pushed.any()
-        else:  # robots 0 and 2 overlap by 4 mm; robot 1 touches, and has nothing of their force
+        else:  # robots 0 and 2 overlap by 4 mm; robot 1 only touches, without any force
             assert pushed[0] == pushed[2] > 0.0
             assert pushed[1] == 0.0
 
@@ -771,7 +784,7 @@ def test_the_way_driven_ends_with_the_arrival(tmp_path: Path) -> None:
     arenas = _start(judge, [[-0.3, 0.2, 0.0], [-0.3, -0.2, 0.0]], [[-0.1, 0.2], [9.0, 0.0]])
     arenas = _run(judge, arenas, 60)
     steps = math.ceil(0.15 / STRIDE)
-    # The first step also speeds up; float32 commands.
+    # The tolerance is for the start from rest in the first step, and for float32 commands.
     np.testing.assert_allclose(arenas.outcome.path[0], [steps * STRIDE, 60 * STRIDE], rtol=1e-3)
 
 
@@ -779,7 +792,7 @@ def test_stillness_begins_anew_with_every_two_centimetres(tmp_path: Path) -> Non
     judge = _judge(tmp_path, _stage(robots=2), AHEAD)
     # Robot 1 pushes the wall from the start.
     arenas = _start(judge, [[-0.3, 0.0, 0.0], [0.5 - 0.037, -0.3, 0.0]])
-    stride = math.ceil(0.02 / STRIDE)  # steps until it is 2 cm away: 5
+    stride = math.ceil(0.02 / STRIDE)  # the robot is 2 cm away after 5 steps
     assert 5 * STRIDE > 0.02 > 4 * STRIDE
     seen = []
     for _ in range(2 * stride + 1):
@@ -791,7 +804,7 @@ def test_stillness_begins_anew_with_every_two_centimetres(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("shape", ["bar", "cross", "ell", "pillar"])
 def test_rays_and_contacts_are_those_of_the_shape(tmp_path: Path, shape: Any) -> None:
-    """MuJoCo's against geometry of their own, on levels with robots right beside the shapes."""
+    """Compares MuJoCo with closed-form geometry, on levels with robots right beside the shapes."""
     judge = _judge(tmp_path, _stage(robots=2, obstacles=1), shape=shape)
     random = np.random.default_rng(0)
     levels = []
@@ -815,7 +828,8 @@ def test_rays_and_contacts_are_those_of_the_shape(tmp_path: Path, shape: Any) ->
     assert np.abs(gap).min() > 1e-6
     touching = engine_c.touching(judge, arenas.data)
     np.testing.assert_array_equal(touching, gap <= 0.0)
-    # A robot sinks 4 mm into things at most; deeper, two rays do not tell what they are inside of.
+    # A robot sinks at most 4 mm into things. Deeper inside, a ray's origin may be inside a thing,
+    # and the ray does not tell which thing that is.
     real = gap.min(axis=(1, 2)) > -0.004
     np.testing.assert_allclose(ray[real], expected[real], atol=1e-6)  # float32 in quaternions
     assert real.sum() > 20

@@ -1,4 +1,4 @@
-"""The judge on the device against the one in MuJoCo C, on the same levels by the same policy."""
+"""Compares the judge on the device with the judge in MuJoCo C, on the same levels and policies."""
 
 from collections.abc import Callable
 from functools import partial
@@ -36,9 +36,9 @@ STAGES = (
     StageConfig(name="s3", robots=3, side=0.7, obstacles=1),
 )
 EPISODES, SEED = 40, 1
-STEPS = 120  # few enough that some robots are late
-CONTROL_STEP = 0.032  # s
-# Action of a policy by hand: at bearing 0, and what each radian to the left and right adds.
+STEPS = 120  # Few enough that some robots are late.
+CONTROL_STEP = 0.032  # Seconds.
+# Hand-made policies: the action at bearing 0, and the changes per radian to the left and right.
 STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
 STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
@@ -67,7 +67,7 @@ def levels(world: World, stage: StageConfig) -> Level:
 
 
 def _arrays(drives: tuple) -> dict[str, np.ndarray]:
-    """Policies of one hidden layer, relu(bearing) and relu(-bearing), a robot each."""
+    """Returns policies with one hidden layer, relu(bearing) and relu(-bearing); one per robot."""
     count = len(drives)
     bearing = np.zeros((count, observation.SIZE, 2), np.float32)
     bearing[:, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
@@ -84,7 +84,7 @@ def _arrays(drives: tuple) -> dict[str, np.ndarray]:
 
 
 def _learners(*drives: tuple) -> LearnerState:
-    """The same policies as learners [L], with what acting takes."""
+    """Returns the same policies as learners [L], with only the parts that acting needs."""
     arrays = _arrays(drives)
 
     def layer(name: str) -> dict[str, np.ndarray]:
@@ -101,7 +101,7 @@ def _learners(*drives: tuple) -> LearnerState:
 
 
 def _by_c(folder: Path, stage: StageConfig, drives: tuple) -> dict[str, np.ndarray]:
-    """What `swarmjax.evaluate` says of the policies, level by level."""
+    """Evaluates the policies in MuJoCo C; returns their measures level by level."""
     meta = {
         "policy": "shared" if len(drives) == 1 else "independent",
         "learners": len(drives),
@@ -125,7 +125,7 @@ def _by_c(folder: Path, stage: StageConfig, drives: tuple) -> dict[str, np.ndarr
 
 
 def _judge(path: Path, stage: StageConfig, engine: Literal["c", "mjx"], **rest: Any) -> Evaluation:
-    """What the command finds, by one of its engines, with the planar body where nothing is said."""
+    """Evaluates a policy as the command does, with one of its engines; by default planar."""
     given = {"robot": RobotConfig(), "seed": SEED, "episodes": EPISODES, "steps": STEPS} | rest
     settings = EvaluateConfig(policy=str(path), stage=stage, engine=engine, workers=1, **given)
     return evaluate(settings)
@@ -149,7 +149,8 @@ def test_levels_are_those_of_the_other_judge(
 
 
 def test_what_a_level_lacks_is_parked_as_in_training(stage: StageConfig, levels: Level) -> None:
-    # 5 m out and 0.5 m apart: robot i at (5 + i / 2, 5), obstacle j at the opposite place.
+    # Absent things stand 5 m out and 0.5 m apart: robot i at (5 + i / 2, 5), and obstacle j at
+    # (-5 - j / 2, -5).
     for i in range(stage.robots, 3):
         np.testing.assert_array_equal(levels.start[:, i], [[5 + 0.5 * i, 5, 0]] * EPISODES)
         np.testing.assert_array_equal(levels.target[:, i], [[5 + 0.5 * i, 5]] * EPISODES)
@@ -173,10 +174,11 @@ def test_agrees_with_mujoco_c(
     assert 5 < free.sum() < EPISODES
     for name, values in expected.items():
         mine = getattr(found, name)
-        # Paths without contact differ by rounding, 1e-6 m, which moves no arrival by a step.
+        # Paths without contact differ by rounding, by 1e-6 m, which shifts no arrival by a step.
         np.testing.assert_allclose(mine[free], values[free], atol=1e-6, err_msg=name)
-        # Contacts magnify it, and the solvers stop at other errors: what is left are single
-        # control steps here, and a robot of one level at most if rounding differs elsewhere.
+        # Contacts magnify the difference, and the solvers stop at different errors. Here this
+        # shifts times by single control steps. If rounding differs elsewhere, at most one robot of
+        # one level may end differently.
         np.testing.assert_allclose(mine.mean(), values.mean(), atol=0.03, err_msg=name)
     assert not found.broken.any()
 
@@ -186,8 +188,9 @@ def test_each_learner_drives_its_own_robot(tmp_path: Path, judge: Run, world: Wo
     levels = engine_mjx.draw_levels(world, STAGES[1], SEED, EPISODES)
     found = judge(_learners(*drives), levels)
     expected = _by_c(tmp_path, STAGES[1], drives)
-    assert np.asarray(found.targets_reached).max() == pytest.approx(2 / 3)  # the second stays
-    # A robot of one level in 40, for the reason given above.
+    # The second robot stays.
+    assert np.asarray(found.targets_reached).max() == pytest.approx(2 / 3)
+    # One robot of one level in 40 may end differently, since contacts magnify rounding.
     for name in ("targets_reached", "all_reached"):
         assert np.asarray(getattr(found, name)).mean() == pytest.approx(
             expected[name].mean(), abs=0.01
@@ -246,9 +249,10 @@ def test_a_stage_that_does_not_fit_is_refused(world: World) -> None:
 def test_the_engines_of_the_command_agree(
     tmp_path: Path, body: Any, shape: Any, learners: int, deviation: float
 ) -> None:
-    """By a policy that is drawn from, on the same levels, in physics steps of the same length."""
+    """The policy samples its actions; both engines have the same levels and physics steps."""
     kind = "shared" if learners == 1 else "independent"
-    # A deviation for each learner and action: those of another would be another path.
+    # Each learner and action has its own deviation, so a deviation of another learner or action
+    # would give another path.
     drawn = np.log(deviation * np.linspace(0.5, 1.5, 2 * learners)).reshape(learners, 2)
     path = steering.write(tmp_path / "policy.npz", STEER, learners, drawn, policy=kind)
     count = 12
@@ -265,15 +269,16 @@ def test_the_engines_of_the_command_agree(
     assert missing == {name for name in c.found if name.startswith("impulse")}
     free = c.found["contacts_per_robot"][0] == 0.0
     assert 2 < free.sum() < count
-    # What is drawn shows in the ways, by twice what is let through below.
+    # Sampling changes the path efficiency by more than twice the tolerance below.
     (mean,) = still.trials
     assert np.abs(mean.found["spl"] - c.found["spl"])[0, free].max() > 4e-3
     for name, found in mjx.found.items():
-        # Without contact paths differ by rounding, which may shift what is counted by a step; ways
-        # are sums of 120 float32 strides.
+        # Without contact, paths differ by rounding, which may shift a count by one step. Path
+        # lengths are sums of 120 float32 strides.
         step = 1.01 / STEPS if name == "ir_steps_share" else 1.01 * CONTROL_STEP
         np.testing.assert_allclose(found[0, free], c.found[name][0, free], atol=step, err_msg=name)
-        # With contacts, a robot of one level at most: the solvers stop at other errors.
+        # With contacts, at most one robot of one level ends differently, since the solvers stop at
+        # different errors.
         most = 3 * CONTROL_STEP if MEASURES[name].unit == "s" else 0.03
         np.testing.assert_allclose(found.mean(), c.found[name].mean(), atol=most, err_msg=name)
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
@@ -285,7 +290,7 @@ def test_the_engines_of_the_command_agree(
 def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str, size: int) -> None:
     given, told = policies.recalling(kind, _arrays((STEER,)), size)
     if kind == "gru":
-        given["actor/mean/kernel"][:, 2:] *= 0.3  # beside the steering, by as many numbers
+        given["actor/mean/kernel"][:, 2:] *= 0.3  # smaller, beside the steering
         none = {name: array * ("memory" not in name) for name, array in given.items()}
     else:
         kernel = given["actor/hidden_0/kernel"]
@@ -299,7 +304,8 @@ def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str,
     free = c.found["contacts_per_robot"][0] == 0.0
     assert free.sum() > 2
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
-    # Without its memory it drives another way, by three times what the engines may differ by.
+    # Without its memory the policy drives another path: the difference is three times the
+    # tolerance between the engines.
     other = tmp_path / "other.npz"
     policy_file.write(other, none | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     forgetful = _judge(other, STAGES[0], "c", episodes=8).trials[0]

@@ -1,4 +1,4 @@
-"""The command that judges policies: its figures by hand, its files, and what it refuses."""
+"""Tests the command that judges policies: figures by hand, files, and refused settings."""
 
 import csv
 import json
@@ -37,7 +37,7 @@ def _stage(robots: int, side: float = 1.0, obstacles: int = 0) -> StageConfig:
 
 
 def _config(path: Path, **rest: Any) -> EvaluateConfig:
-    """An evaluation with the planar body, which is the faster one, in one process."""
+    """Returns settings with one process and the planar body, which is the faster body."""
     plain = {"robot": RobotConfig(), "workers": 1} | rest
     return EvaluateConfig(policy=str(path), **plain)
 
@@ -71,9 +71,9 @@ def test_a_result_does_not_depend_on_batches_and_workers(
 def test_steering_to_the_target_reaches_it_in_empty_arenas(tmp_path: Path, side: float) -> None:
     path = steering.write(tmp_path / "policy.npz")
     found = _measures(_config(path, stage=_stage(2, side), episodes=40, steps=400))
-    assert found["targets_reached"]["mean"] >= 0.95  # only another robot can be in the way
-    # The arena's diagonal at full speed, a turn by half a circle at 3.14 rad/s, and a share of
-    # 0.05 that is late by the whole episode.
+    assert found["targets_reached"]["mean"] >= 0.95  # Only another robot can be in the way.
+    # The bound is the time for the arena's diagonal at full speed and for half a turn at 3.14
+    # rad/s, plus 1 s, plus a share of 0.05 of robots that take the whole episode.
     late = 0.05 * 400 * STEP
     assert 0.0 < found["time_to_reach_s"]["mean"] < side * math.sqrt(2) / SPEED + 1.0 + 1.0 + late
     assert 0.5 < found["spl"]["mean"] <= found["targets_reached"]["mean"]
@@ -85,7 +85,7 @@ def test_standing_still_reaches_nothing(tmp_path: Path) -> None:
     found = {name: each["mean"] for name, each in _measures(settings).items()}
     for name in ("targets_reached", "all_reached", "spl", "contacts_per_robot", "impulse_ns_wall"):
         assert found[name] == 0.0
-    # 160 control steps are 5.12 s: a deadlock, with no time left.
+    # 160 control steps are 5.12 s, which is long enough for a deadlock and ends in a time-out.
     assert found["deadlocks"] == found["time_outs"] == 1.0
     assert found["episode_time_s"] == pytest.approx(160 * STEP)
     assert found["time_to_reach_s"] == pytest.approx(160 * STEP)
@@ -129,11 +129,11 @@ def test_a_comparison_is_paired_by_level() -> None:
     contacts = evaluate_summary.compare(
         {"contacts_per_robot": a["targets_reached"]}, {"contacts_per_robot": b["targets_reached"]}
     )["contacts_per_robot"]
-    assert contacts["improvement"] == 1.0  # fewer is better
+    assert contacts["improvement"] == 1.0  # fewer contacts are better
 
 
 def test_strata_of_two_levels_have_no_interval() -> None:
-    """Drawn anew, a stratum of one level never changes: the interval would have no width."""
+    """A resample of a stratum of one level never changes, so the interval would have no width."""
     table = {"spl": np.random.default_rng(1).random((1, 10))}
     for strata, there in (([5, 5], True), ([7, 3], True), ([8, 2], False), ([1] * 10, False)):
         found = evaluate_summary.summarize(table, strata)["spl"]
@@ -143,7 +143,7 @@ def test_strata_of_two_levels_have_no_interval() -> None:
 
 
 def _trial(name: str, *, seed: int = 1_000_000, first: int = 0, **stage: Any) -> Trial:
-    """A trial by one policy on ten levels, with figures of their own."""
+    """Returns a trial of one policy on ten levels, with random path efficiencies."""
     numbers = np.arange(first, first + 10)
     plain = StageConfig(**({"name": name, "robots": 2, "side": 1.0} | stage))
     levels: Any = None
@@ -156,7 +156,7 @@ def _trial(name: str, *, seed: int = 1_000_000, first: int = 0, **stage: Any) ->
     ("other", "shared"),
     [
         ({}, True),
-        ({"first": 9}, True),  # one level
+        ({"first": 9}, True),  # one level is shared
         ({"first": 10}, False),
         ({"seed": 1_000_001}, False),
         ({"side": 1.1}, False),
@@ -180,7 +180,7 @@ def test_cells_that_share_levels_are_not_pooled(
 
 
 def test_long_lists_of_files_are_taken_apart() -> None:
-    names = [f"policy{i}.npz" for i in range(1000)]  # no path may be as long as them together
+    names = [f"policy{i}.npz" for i in range(1000)]  # joined, too long for a path
     assert list_files("policy", ",".join(names)) == names
 
 
@@ -188,7 +188,7 @@ def test_long_lists_of_files_are_taken_apart() -> None:
 
 
 def _plain(section: Any) -> dict[str, Any]:
-    """A section of the configuration as JSON has it."""
+    """Returns a section of the configuration as plain JSON data."""
     return json.loads(json.dumps(to_dict(section)))
 
 
@@ -224,13 +224,13 @@ def test_the_command_writes_the_result_and_prints_a_table(
     row = next(line for line in printed.out.splitlines() if "targets reached, %" in line)
     assert f"{100 * cell['measures']['targets_reached']['mean']:.1f}" in row.split()
     assert f"{path} on s1, 3 episodes" in printed.out
-    assert "\x1b" not in printed.out  # plain where it is no terminal
+    assert "\x1b" not in printed.out  # no colours, since the output is not a terminal
     assert printed.err == ""
 
 
 @pytest.fixture
 def suite(tmp_path: Path) -> Path:
-    """A suite of two small cells, as a file for any tool."""
+    """Writes the levels of a suite of two small cells; returns the path of the file."""
     file = tmp_path / "tiny.yaml"
     file.write_text(
         "name: tiny\ncells:\n"
@@ -331,7 +331,7 @@ def test_unreachable_targets_are_shown(
 
 
 def _lost(start: np.ndarray) -> np.ndarray:
-    """Lengths of ways, of which two of three levels lack one."""
+    """Returns lengths of shortest paths; in two of three levels one robot has no path."""
     lengths = np.ones(start.shape[:-1])
     lengths[1:, 0] = np.inf
     return lengths
@@ -339,7 +339,7 @@ def _lost(start: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def wrong(tmp_path: Path) -> None:
-    """Policies that do not fit."""
+    """Writes a policy that fits, and three policies that do not."""
     steering.write(tmp_path / "policy.npz")
     steering.write(tmp_path / "three.npz", learners=3, policy="independent")
     layout = observation.describe("metric") | {"limit": 10.0}
@@ -378,12 +378,12 @@ def wrong(tmp_path: Path) -> None:
         ),
         (
             ["policy=other.npz", "stage=s1"],
-            "other.npz was trained on other observations than this robot makes: its "
+            "other.npz was trained on observations that differ from this robot's: its "
             f"meta.observation.names is {observation.NAMES[0]}, ",
         ),
         (
             ["policy=scaled.npz", "stage=s1"],
-            "scaled.npz was trained on other observations than this robot makes: its "
+            "scaled.npz was trained on observations that differ from this robot's: its "
             "meta.observation.scale is 2.0, ",
         ),
         (["policy=policy.npz", "suite=stage"], "suite is 'stage': give one of "),
@@ -406,7 +406,7 @@ def test_the_command_refuses_in_one_sentence(
     words: list[str],
     sentence: str,
 ) -> None:
-    # A value that is long, as a path may be, is cut short in a sentence.
+    # Sentences shorten long values such as paths, so the paths here are relative.
     monkeypatch.chdir(tmp_path)
     short = [] if any(word.startswith("suite=") for word in words) else ["episodes=1"]
     assert _command(monkeypatch, *words, "workers=1", *short) == 2
@@ -423,5 +423,5 @@ def test_a_comparison_takes_as_many_policies_of_either_recipe(
     monkeypatch.chdir(tmp_path)
     assert _command(monkeypatch, "compare=policy.npz,*e*.npz", "stage=s1", "episodes=1") == 2
     printed = capsys.readouterr().err
-    assert "compare is 'policy.npz,*e*.npz', which is 1 against 3: give as many " in printed
+    assert "compare is 'policy.npz,*e*.npz', with 1 and 3 policies: give the same " in printed
     assert printed.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Hearing in both judges: who is hidden, what policies observe, and files that do not fit."""
+"""Tests hearing in both judges: hidden robots, observations, and policy files that do not fit."""
 
 from functools import partial
 from pathlib import Path
@@ -100,10 +100,10 @@ def test_both_engines_come_to_the_same_by_a_policy_that_hears(kind: str, tmp_pat
     world = engine_mjx.load(judge.config, levels[0].obstacle[:, 3:], 8)
     stacked = type(levels[0])(*map(np.stack, zip(*levels, strict=True)))
     by_mjx = engine_mjx.play(world, stacked, judge.policy, 10, sampled=True)
-    np.testing.assert_allclose(by_mjx.path, by_c.path, atol=1e-4)  # m, of 1 to 40 mm
+    np.testing.assert_allclose(by_mjx.path, by_c.path, atol=1e-4)  # m; paths are 1 to 40 mm long
     deaf = judge.policy._replace(hearing=tuple(0 * part for part in judge.policy.hearing or ()))
     unheard = engine_c.simulate(_with(judge, deaf), levels)
-    assert np.abs(unheard.path - by_c.path).max() > 5e-4  # five times that
+    assert np.abs(unheard.path - by_c.path).max() > 5e-4  # m; five times the tolerance above
 
 
 def _with(judge: evaluate_judge.Judge, trained: Policy) -> evaluate_judge.Judge:
@@ -129,7 +129,8 @@ def test_another_hearing_is_refused(key: str, value: float, held: float, tmp_pat
     )
     assert sentence == (
         f"task.neighbours.{key} is {value}, but {path} was trained with {held}: leave "
-        f"task.neighbours.{key} out, since each policy is judged with its own."
+        f"task.neighbours.{key} out, since each policy is judged with the value that it was "
+        "trained with."
     )
 
 

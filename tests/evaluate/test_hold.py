@@ -1,4 +1,4 @@
-"""Both judges by `task.arrival=hold`: by a scene worked out by hand, and on the same levels."""
+"""Tests both judges with `task.arrival=hold`: a scene worked out by hand, and the same levels."""
 
 from collections.abc import Callable
 from functools import partial
@@ -32,13 +32,13 @@ Play = Callable[[np.ndarray], Outcome]
 
 
 def _settings(path: Path, **rest: Any) -> EvaluateConfig:
-    """Of the planar body, whose motion is worked out by hand."""
+    """Returns settings with the planar body, whose motion is worked out by hand."""
     given: dict[str, Any] = {"stage": PAIR, "robot": RobotConfig(), "task": HOLD, "workers": 1}
     return EvaluateConfig(policy=str(path), **(given | rest))
 
 
 def _by_c(path: Path, actions: np.ndarray) -> Outcome:
-    """Plays the scene in MuJoCo C, until it is over."""
+    """Plays the scene in MuJoCo C until both robots have arrived or the actions end."""
     mine = judge.load(_settings(path), policy_file.read(str(path)))
     arenas = engine_c.start(mine, [holding.level()])
     for action in actions:
@@ -49,7 +49,7 @@ def _by_c(path: Path, actions: np.ndarray) -> Outcome:
 
 
 def _by_mjx(path: Path, actions: np.ndarray) -> Outcome:
-    """Plays it in the engine that trains."""
+    """Plays the scene in the engine that trains."""
     levels = Level(*(np.asarray(field)[None] for field in holding.level()))
     world = engine_mjx.load(_settings(path), np.zeros((0, 2)), 1)
 
@@ -73,25 +73,26 @@ def test_complete_is_all_within_their_targets_at_once(play: Play) -> None:
     found = play(holding.actions())
     assert found.clock.tolist() == [RETURNS]
     assert found.arrived.tolist() == [[True, True]]
-    # Since when they have been there: not when robot 0 first came.
+    # The arrival is the start of a robot's last stay, not the first time that robot 0 entered.
     assert found.arrival.tolist() == [[RETURNS, OTHER]]
 
 
 def test_what_counts_as_on_the_way_are_steps_begun_outside(play: Play) -> None:
     found = play(holding.actions())
-    # Robot 0: until it enters, and from the step after it left until it is back.
+    # Robot 0 moves until it enters, and from the step after it left until it is back.
     assert found.moving.tolist() == [[ENTERS + RETURNS - LEAVES, OTHER]]
-    # Of these it turned in 31; 1e-3 m for the first stride, which speeds up in C, and float32.
+    # In 31 of these steps robot 0 only turned. The tolerance of 1e-3 m is for the first stride,
+    # which starts from rest in C, and for float32.
     strides = ENTERS + RETURNS - LEAVES - 31
     np.testing.assert_allclose(found.path, [[strides * PACE, OTHER * PACE]], atol=1e-3)
 
 
 def test_who_waits_within_the_target_never_stands_still(play: Play) -> None:
-    """Robot 1 waits for 24 steps; robot 0, which turned for 31, has come back."""
+    """Robot 1 waits for 24 steps at its target; robot 0 turned for 31 steps and has come back."""
     assert play(holding.actions()).still.tolist() == [[0, 0]]
 
 
-# --- episodes cut short, which the engine on the device does not know
+# --- episodes cut short, which the engine on the device does not support
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +129,7 @@ def _judged(path: Path, engine: Any, **rest: Any) -> Evaluation:
 
 
 def test_the_judges_agree_on_the_same_levels(tmp_path: Path) -> None:
-    # Turns to its target, and drives slowly: it comes to rest nowhere, and passes through.
+    # A robot turns to its target, drives slowly and never stops, so it passes through the target.
     path = steering.write(tmp_path / "policy.npz", ((0.2, 0.0), (-2.0, 2.0), (-2.0, -2.0)))
     (c,), (mjx,) = (_judged(path, engine).trials for engine in ("c", "mjx"))
     free = c.found["contacts_per_robot"][0] == 0.0
@@ -137,14 +138,14 @@ def test_the_judges_agree_on_the_same_levels(tmp_path: Path) -> None:
     for name in ("targets_reached", "all_reached", "contacts_per_robot", "deadlocks", "time_outs"):
         np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free], name)
     for name in ("time_to_reach_s", "episode_time_s"):
-        # Without contacts paths differ by rounding, which may shift an arrival by a step.
+        # Without contacts, paths differ by rounding, which may shift an arrival by one step.
         found, expected = mjx.found[name][0, free], c.found[name][0, free]
         np.testing.assert_allclose(found, expected, atol=1.01 * SECOND, err_msg=name)
     np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
 
 
 def test_the_rule_changes_what_is_judged_and_not_the_levels(tmp_path: Path) -> None:
-    """Robots that drive ahead pass through their targets: by latch they stop there."""
+    """Robots that drive ahead pass through their targets with `hold`, and stop with `latch`."""
     path = steering.write(tmp_path / "policy.npz", steering.AHEAD)
     latch, hold = (_judged(path, "c", task=TaskConfig(arrival=rule)) for rule in ("latch", "hold"))
     digests = [each.result["cells"][0]["digest"] for each in (latch, hold)]
@@ -155,7 +156,7 @@ def test_the_rule_changes_what_is_judged_and_not_the_levels(tmp_path: Path) -> N
 
 
 def test_a_level_is_judged_alike_beside_whatever_others(tmp_path: Path) -> None:
-    """An arena that is complete stays so while others go on."""
+    """An arena that is complete stays complete while other arenas go on."""
     path = steering.write(tmp_path / "policy.npz")
     settings = _settings(path, stage=STAGE, episodes=12, steps=STEPS)
     mine = judge.load(settings, policy_file.read(str(path)))

@@ -1,4 +1,4 @@
-"""Measures of episodes by hand."""
+"""Tests the measures of episodes, worked out by hand."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ STEP, STEPS = 0.1, 30  # s; control steps of an episode
 
 
 def _outcome() -> Outcome:
-    """Three levels of two robots: both arrive, one does, none does."""
+    """Returns three levels of two robots: two, one and none of the robots arrive."""
     contacts = np.zeros((3, 2, 3), int)
     contacts[0, 0] = [1, 0, 2]
     contacts[2, 1] = [1, 2, 0]
@@ -35,16 +35,17 @@ def test_per_level_by_hand() -> None:
     expected = {
         "targets_reached": [1.0, 0.5, 0.0],
         "all_reached": [1.0, 0.0, 0.0],
-        # Who has not arrived counts with the whole episode, 3 s.
+        # A robot that has not arrived counts with the whole episode of 3 s.
         "time_to_reach_s": [(0.4 + 1.0) / 2, (0.6 + 3.0) / 2, 3.0],
         "episode_time_s": [1.0, 3.0, 3.0],
-        # 0.4 / 0.5 and 1, as it drove less than the shortest way; 1 and 0.
+        # On the first level the robots have 0.4 / 0.5, and 1 for a path shorter than the shortest
+        # path. On the second level they have 1 and 0.
         "spl": [(0.8 + 1.0) / 2, 0.5, 0.0],
         "contacts_per_robot": [1.5, 0.0, 1.5],
         "contacts_robot": [0.5, 0.0, 0.5],
         "contacts_obstacle": [0.0, 0.0, 1.0],
         "contacts_wall": [1.0, 0.0, 0.0],
-        "contact_s_per_robot": [0.45, 0.0, 0.45],  # three steps each
+        "contact_s_per_robot": [0.45, 0.0, 0.45],  # three steps per contact
         "contact_s_robot": [0.15, 0.0, 0.15],
         "contact_s_obstacle": [0.0, 0.0, 0.3],
         "contact_s_wall": [0.3, 0.0, 0.0],
@@ -53,7 +54,7 @@ def test_per_level_by_hand() -> None:
         "impulse_ns_obstacle": [0.0, 0.0, 0.5],
         "impulse_ns_wall": [0.5, 0.0, 0.0],
         "ir_steps_share": [3 / 14, 7 / 26, 15 / 60],
-        # Still for 5 s: 50 steps; those that have arrived may stand.
+        # A robot is in a deadlock after 50 steps (5 s) at rest, unless it has arrived.
         "deadlocks": [0.0, 0.5, 0.5],
         "time_outs": [0.0, 1.0, 1.0],
     }
@@ -72,9 +73,9 @@ def test_what_an_engine_does_not_tell_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("arrived", "shortest", "driven", "expected"),
     [
-        (True, 0.0, 0.0, 1.0),  # started within the target's radius
+        (True, 0.0, 0.0, 1.0),  # the robot starts within the target's radius
         (True, 0.0, 0.3, 0.0),
-        (True, np.inf, 0.3, 0.0),  # cannot be
+        (True, np.inf, 0.3, 0.0),  # cannot happen
         (False, 1.0, 0.3, 0.0),
         (True, 1.0, 4.0, 0.25),
     ],

@@ -1,4 +1,4 @@
-"""Shortest ways against hand-worked ones, and against a flood on a grid."""
+"""Tests shortest paths against paths worked out by hand, and against a search on a grid."""
 
 import math
 
@@ -12,9 +12,10 @@ from scipy.sparse.csgraph import dijkstra
 from swarmjax.evaluate import shortest_path
 
 HULL, REACH = 0.037, 0.05
-# One right angle around a corner, along points outside of it: 0.8 mm.
+# A path along the points outside a corner is at most 0.8 mm too long for each right angle.
 SLACK = 1e-3
-# Four points for a right angle turn 22.5 degrees each; so much longer is what is around an arc.
+# Four points for each right angle turn a path by 22.5 degrees each. Such a path is longer than the
+# arc by this factor.
 LONGER = math.tan(math.pi / 16) / (math.pi / 16)
 
 
@@ -25,7 +26,7 @@ def _shortest(
     side: float = 2.0,
     reach: float = REACH,
 ) -> float:
-    """Of one robot, m."""
+    """Returns the length of one robot's shortest path, m."""
     found = shortest_path.shortest(
         np.array([side]),
         np.array([[start]]),
@@ -40,32 +41,32 @@ def _shortest(
 def test_the_straight_way() -> None:
     assert _shortest([0, 0], [0.3, 0.4], []) == pytest.approx(0.45)
     assert _shortest([0, 0], [0.03, 0.0], []) == 0.0
-    # A box whose widened outline the way just misses.
+    # The path just misses the widened outline of the box.
     beside = 0.05 + HULL + 1e-5
     assert _shortest([-0.5, beside], [0.5, beside], [[0, 0, 0, 0.05, 0.05]]) == pytest.approx(0.95)
 
 
 def test_around_a_plate_by_hand() -> None:
-    """Tangents from both points to the disc about the plate's end, and the arc between them."""
+    """The path has two tangents to a disc at the plate's tip, and an arc between the tangents."""
     half, away = 0.3, 0.4
     found = _shortest([-away, 0.0], [away, 0.0], [[0, 0, 0, 1e-9, half]])
     reach = math.hypot(away, half)
     tangent = math.sqrt(reach**2 - HULL**2)
-    # A full circle at the end of the plate, less the angle between the points and what either
-    # tangent takes off.
+    # The arc is a full circle at the end of the plate, less the angle between the two points and
+    # the angle that each tangent takes off.
     arc = 2 * math.pi - 2 * math.atan2(away, half) - 2 * math.acos(HULL / reach)
     expected = 2 * tangent + HULL * arc
-    # The last leg ends 0.05 m before the target, on the straight to it.
+    # The last leg ends 0.05 m before the target, on the straight line to the target.
     assert expected - REACH - 1e-9 <= found <= expected - REACH + SLACK
 
 
 def _taut(start: list[float], corners: list[list[float]], target: list[float]) -> list[float]:
-    """Length of a string around discs about corners, all on its right: all, and along arcs, m."""
+    """Returns lengths of a taut string around discs at corners on its right: all, and arcs, m."""
     points = np.array([start, *corners, target])
     legs = np.diff(points, axis=0)
     length = np.hypot(*legs.T)
     heading = np.unwrap(np.arctan2(legs[:, 1], legs[:, 0]))
-    # The tangents at both ends leave the lines to the centres by asin(radius / distance).
+    # The tangents at both ends deviate from the lines to the centres by asin(radius / distance).
     first, last = (math.asin(HULL / x) for x in (length[0], length[-1]))
     arcs = HULL * float(heading[0] + first - (heading[-1] - last))
     straight = float(length[1:-1].sum()) + sum(
@@ -82,7 +83,7 @@ T = 0.005  # m, half the thickness of a wall
     ("start", "corners", "target", "walls"),
     [
         ([0.4, -0.7], [[0.0, -0.5]], [-0.2, 0.1], [[0.5, 0.0, 0.5, 0.5]]),
-        # A corridor of 0.2 m that bends to the right; its inner corner is that of two walls.
+        # A corridor of 0.2 m bends to the right, and two walls meet at its inner corner.
         (
             [0.1, -0.5],
             [[0.2 - T, 0.0 + T]],
@@ -94,7 +95,7 @@ T = 0.005  # m, half the thickness of a wall
                 [0.4, 0.2, 0.4 + T, T],
             ],
         ),
-        # Out of a U, whose sides are of two walls each, and back to behind its bottom.
+        # The path leads out of a U, whose right side has two walls, and back behind its bottom.
         (
             [0.1, 0.1],
             [[0.2 - T, 0.4 + T], [0.2 + T, 0.4 + T], [0.2 + T, -T]],
@@ -106,7 +107,8 @@ T = 0.005  # m, half the thickness of a wall
                 [0.0, 0.0, 0.2 + T, T],
             ],
         ),
-        # Past a corridor, although a way of 1.97 m zigzags through it, nearer to the straight line.
+        # The path leads past a corridor. A zigzag path of 1.97 m through the corridor is closer to
+        # the straight line, but longer.
         (
             [-0.6, 0.0],
             [[-0.35, 0.3 + T], [0.35, 0.3 + T]],
@@ -133,14 +135,15 @@ def test_among_walls_by_hand(
     boxes = [[*(turn @ [x, y]), yaw, *half] for x, y, *half in walls]
     found = _shortest(list(turn @ start), list(turn @ target), boxes, side=4.0)
     length, arcs = _taut(start, corners, target)
-    # The last leg ends 0.05 m before the target, on the straight to it. Around an arc the way is
-    # longer by that factor; at either end of one it may go to a point half a step beyond it.
+    # The last leg ends 0.05 m before the target, on the straight line to the target. Around an arc
+    # the path is longer by the factor LONGER. At either end of an arc it may lead to a point half a
+    # step beyond the arc.
     most = (LONGER - 1) * (arcs + 2 * len(corners) * HULL * math.pi / 16)
     assert length - REACH - 1e-9 <= found <= length - REACH + most
 
 
 def _maze(random: np.random.Generator, cells: int, edge: float) -> list[list[float]]:
-    """Unit walls of a maze, touching each other: one way joins any two of its cells."""
+    """Returns touching walls of a maze, in which exactly one path joins any two cells."""
     sides = [(i, j, k) for i in range(cells) for j in range(cells) for k in (0, 1)]
     sides = [each for each in sides if each[each[2]] + 1 < cells]
     part = np.arange(cells**2).reshape(cells, cells)
@@ -161,18 +164,19 @@ def test_ways_through_a_maze_are_those_of_a_grid(seed: int) -> None:
     cells, edge = 4, 0.25
     random = np.random.default_rng(seed)
     walls = _maze(random, cells, edge)
-    assert len(walls) == 9  # of 24 sides, all but the 15 of a tree
+    assert len(walls) == 9  # of 24 sides, all but the 15 that join the cells as a tree
     ends = (random.permutation(cells**2)[:10].reshape(5, 2)[..., None] // [cells, 1]) % cells
     for start, target in (ends + 0.5 - cells / 2) * edge:
         found = _shortest(list(start), list(target), walls, cells * edge)
         expected = _by_grid(cells * edge, start, target, np.array(walls))
-        # As below; in these corridors of 0.24 m nothing is closed to the grid alone.
+        # The bounds are those of `test_ways_are_those_of_a_grid`. All corridors are 0.24 m wide, so
+        # the grid closes none of them.
         assert found <= expected + 2 * CELL + SLACK
         assert expected <= 1.027 * found + 4 * CELL
 
 
 def test_robots_of_an_arena_do_not_change_each_others_ways() -> None:
-    """What one has found out is kept for the next."""
+    """The results for one robot's path are kept for the next robot."""
     random = np.random.default_rng(5)
     walls = _maze(random, 4, 0.25)
     ends = (random.permutation(16).reshape(8, 2)[..., None] // [4, 1] % 4 - 1.5) * 0.25
@@ -180,7 +184,8 @@ def test_robots_of_an_arena_do_not_change_each_others_ways() -> None:
         np.array([1.0]), ends[None, :, 0], ends[None, :, 1], np.array([walls]), HULL, REACH
     )
     alone = [_shortest(list(start), list(target), walls, 1.0) for start, target in ends]
-    # The same sums, of which legs may be those found from their other end: their last bits.
+    # The sums are the same, but a leg may be computed from its other end, which changes the last
+    # bits.
     np.testing.assert_allclose(together[0], alone, rtol=1e-14)
 
 
@@ -196,8 +201,9 @@ def test_no_way_leads_through_a_closed_cell_of_a_maze(shut_in: str) -> None:
     assert _shortest(start, target, walls + cell, 1.0) == math.inf
 
 
-# Whole centimetres: no gap between axis-parallel boxes is then between 7.4 cm, the disc's diameter,
-# and 7.54 cm, that of its outline's points, where a way may be there that no points lead along.
+# With whole centimetres, no gap between axis-parallel boxes is between 7.4 cm and 7.54 cm. These
+# are the diameter of the disc and the diameter of the points around it. In a gap between these two,
+# there may be a path that no points lead along.
 _CM = st.integers(-50, 50).map(lambda x: x / 100)
 _HALF = st.integers(1, 30).map(lambda x: x / 100)
 _BOX = st.tuples(_CM, _CM, st.just(0.0), _HALF, _HALF).map(list)
@@ -205,7 +211,7 @@ _PLACE = st.tuples(_CM, _CM).map(list)
 
 
 def _is_clear(place: list[float], boxes: list[list[float]]) -> bool:
-    """Whether the disc stands at a place [2] with 1 mm to spare of boxes [M, 5], at any yaw."""
+    """Tells whether a disc at a place [2] is at least 1 mm from boxes [M, 5] of any yaw."""
     for x, y, yaw, *half in boxes:
         dx, dy = place[0] - x, place[1] - y
         u, v = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
@@ -219,11 +225,12 @@ def test_what_holds_of_any_way(
     start: list[float], target: list[float], boxes: list[list[float]], more: list[float]
 ) -> None:
     assume(_is_clear(start, [*boxes, more]) and _is_clear(target, [*boxes, more]))
-    near = 1e-5  # m, so that start and target may be exchanged
+    near = 1e-5  # m; small, so that start and target may be exchanged
     found = _shortest(start, target, boxes, 1.2, near)
     assert found >= math.dist(start, target) - near - 1e-12
     assert _shortest(target, start, boxes, 1.2, near) == pytest.approx(found, abs=2 * near)
-    # Another box may lend its points to a way around a corner, which is at most so much too long.
+    # A path around a corner is too long by at most the factor LONGER, and the points of another box
+    # may shorten the path.
     assert LONGER * (_shortest(start, target, [*boxes, more], 1.2, near) + near) >= found
 
 
@@ -232,14 +239,14 @@ def test_no_way_leads_out_of_a_cage() -> None:
         (0.3, 0, (0.02, 0.32)), (-0.3, 0, (0.02, 0.32)),
         (0, 0.3, (0.32, 0.02)), (0, -0.3, (0.32, 0.02)))]  # fmt: skip
     assert _shortest([0, 0], [0.8, 0.0], cage) == math.inf
-    # A gap of two hulls in one side lets it out.
+    # A gap of more than two hulls in the cage lets the robot out.
     cage[0] = [0.3, 0.06, 0, 0.02, 0.30]
     cage[3] = [-0.16, -0.3, 0, 0.16, 0.02]
     assert 0.75 < _shortest([0, 0], [0.8, 0.0], cage) < 2.0
 
 
 def test_walls_bar_the_way_too() -> None:
-    """A plate from wall to wall but for less than a hull, and for more."""
+    """A plate from wall to wall has a gap 1 mm narrower, or 1 mm wider, than the hull."""
     for gap, there in ((2 * HULL - 1e-3, False), (2 * HULL + 1e-3, True)):
         plate = [0.0, -gap / 2, 0.0, 0.02, 0.5 - gap / 2]
         found = _shortest([-0.3, 0.0], [0.3, 0.0], [plate], side=1.0)
@@ -247,7 +254,7 @@ def test_walls_bar_the_way_too() -> None:
 
 
 def test_a_target_in_a_corner_is_out_of_reach() -> None:
-    """The disc's centre comes to (0.463, 0.463) at best, 0.037 m sqrt(2) from the very corner."""
+    """The disc's centre can reach only (0.463, 0.463), which is 0.037 m sqrt(2) from the corner."""
     assert math.sqrt(2) * HULL > REACH
     assert _shortest([0.0, 0.0], [0.5, 0.5], [], side=1.0) == math.inf
     assert _shortest([0.0, 0.0], [0.5, 0.5], [[-0.3, 0, 0, 0.02, 0.1]], side=1.0) == math.inf
@@ -258,12 +265,13 @@ def test_walls_stop_the_straight_way() -> None:
     assert _shortest([0.0, 0.0], [0.498, 0.498], [], side=1.0) == pytest.approx(
         math.sqrt(2) * 0.498 - REACH
     )
-    # Along the wall the line would end at y = 0.498 - 0.05 * 0.038 / 0.2036 = 0.4887 m; the disc
-    # keeps to y = 0.463 m, and ends where that meets the circle about the target.
+    # Along the wall the straight line would end at y = 0.498 - 0.05 * 0.038 / 0.2036 = 0.4887 m.
+    # The disc reaches at most y = 0.463 m, so its path ends where y = 0.463 m meets the circle
+    # around the target.
     start, target = [0.4, 0.46], [0.2, 0.498]
     stop = 0.2 + math.sqrt(REACH**2 - (0.498 - 0.463) ** 2)
     assert _shortest(start, target, [], side=1.0) == pytest.approx(math.dist(start, [stop, 0.463]))
-    # At its target already, pressed into the wall.
+    # The robot is pressed into the wall and already at its target.
     assert _shortest([0.47, 0.0], [0.49, 0.0], [], side=1.0) == 0.0
 
 
@@ -271,7 +279,7 @@ CELL = 0.01  # m, of the grid
 
 
 def _by_grid(side: float, start: np.ndarray, target: np.ndarray, boxes: np.ndarray) -> float:
-    """Dijkstra over the free cells of a grid and their 16 nearest neighbours."""
+    """Returns a path's length by Dijkstra's algorithm on a grid with 16 neighbours per cell, m."""
     axis = np.arange(-side / 2 + CELL / 2, side / 2, CELL)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     free = np.maximum(np.abs(x), np.abs(y)) <= side / 2 - HULL
@@ -313,21 +321,21 @@ def test_ways_are_those_of_a_grid() -> None:
             cut_off += found == expected
             disagreements += found != expected
             continue
-        # Ways along 16 directions are up to 2.7 % longer; cells shift either end by 0.7 cells,
-        # and may close a narrow passage to the grid alone.
+        # Paths along 16 directions are up to 2.7 % longer. The grid shifts either end by up to 0.7
+        # cells, and may close a narrow passage that is open to the disc.
         assert found <= expected + 2 * CELL + SLACK
         assert found >= straight - 1e-9
         longer += found > straight + 0.01
         close.append(expected <= 1.027 * found + 4 * CELL)
-    assert np.mean(close) > 0.8  # the seed is fixed; 0.9 were seen
+    assert np.mean(close) > 0.8  # the seed is fixed; the measured share is 0.9
     assert longer > 8
     assert cut_off > 0
-    # The seed is fixed; two passages, narrower than a cell, are closed to the grid alone.
+    # The seed is fixed. Two passages, narrower than a cell, are closed on the grid only.
     assert disagreements <= 2
 
 
 def _free_places(random: np.random.Generator, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two places of the arena that no box covers."""
+    """Draws two places in the arena where the disc meets no box."""
     while True:
         place = random.uniform(-0.55, 0.55, (2, 2))
         if all(_is_clear(list(each), boxes.tolist()) for each in place):

@@ -1,4 +1,4 @@
-"""Statistics: worked out by hand, against SciPy, and by what an interval promises."""
+"""Tests statistics by hand, against SciPy, and by the coverage that intervals promise."""
 
 import math
 import tracemalloc
@@ -15,7 +15,7 @@ from swarmjax.evaluate import statistics
 from swarmjax.evaluate.curves import area_under, curve, steps_to
 from swarmjax.evaluate.statistics import bootstrap, cvar, iqm, paired, probability_of_improvement
 
-ROUNDING = 1e-12  # of sums of numbers up to 100 in double precision, some in another order
+ROUNDING = 1e-12  # for sums of numbers up to 100 in double precision, added in another order
 FINITE = st.floats(-100, 100, width=32)
 LISTS = arrays(np.float64, st.integers(1, 40), elements=FINITE)
 TABLES = arrays(np.float64, st.tuples(st.integers(3, 6), st.integers(1, 3)), elements=FINITE)
@@ -24,27 +24,27 @@ few = settings(max_examples=30, deadline=None)
 
 
 def _refusal(function, *arguments, **options) -> str:
-    """Return the sentence with which a call is refused, and hold it to being one."""
+    """Returns the message with which a call is refused; checks that it is one sentence."""
     with pytest.raises(ValueError, match=r"^[^\n]*\.$") as caught:
         function(*arguments, **options)
     return str(caught.value)
 
 
 def _end_error(resamples: int, sd: float) -> float:
-    """Four standard errors of an end of a 95 % interval over normal resamples.
+    """Returns four standard errors of an end of a 95 % interval over normal resamples.
 
-    The 2.5th percentile of n draws has the sd sqrt(0.025 * 0.975 / n) / density, and the normal
-    density there is 0.0584 / sd.
+    The 2.5th percentile of n draws has the sd sqrt(0.025 * 0.975 / n) / density. The normal density
+    at this percentile is 0.0584 / sd.
     """
     return float(4 * math.sqrt(0.025 * 0.975 / resamples) / stats.norm.pdf(1.96) * sd)
 
 
 def test_iqm_by_hand() -> None:
-    # Eight values: two off either end, (3 + 4 + 5 + 6) / 4.
+    # Of eight values, two are cut off at either end: (3 + 4 + 5 + 6) / 4.
     assert iqm([8.0, 1.0, 100.0, 3.0, 4.0, 5.0, 6.0, 2.0]) == 4.5
-    # Seven: a quarter is 1.75, rounded down to one off either end, (2 + 3 + 4 + 5 + 6) / 5.
+    # A quarter of seven values is 1.75, so one is cut off at either end: (2 + 3 + 4 + 5 + 6) / 5.
     assert iqm([7.0, 1.0, 6.0, 2.0, 5.0, 3.0, 4.0]) == 4.0
-    # Three: nothing is off.
+    # Of three values, none is cut off.
     assert iqm([0.0, 0.0, 9.0]) == 3.0
     assert iqm([True, True, False, False, True]) == pytest.approx(2 / 3, abs=ROUNDING)
 
@@ -70,7 +70,8 @@ def test_order_does_not_matter(x: np.ndarray, random) -> None:
 
 @pytest.mark.parametrize(
     ("infinite", "expected"),
-    # Of eight values two come off either end: 3, 4, 5, 6 are left of those with two infinite ones.
+    # Of eight values, two are cut off at either end. With two infinite values, 3, 4, 5 and 6 are
+    # left.
     [(2, 4.5), (3, math.inf), (8, math.inf)],
 )
 def test_iqm_is_infinite_with_more_than_a_quarter(infinite: int, expected: float) -> None:
@@ -81,21 +82,21 @@ def test_cvar_by_hand() -> None:
     x = np.array([[5.0, 1.0, 4.0, 2.0, 3.0], [10.0, 30.0, 20.0, 50.0, 40.0]])
     np.testing.assert_array_equal(cvar(x, 0.4, axis=1), [1.5, 15.0])
     np.testing.assert_array_equal(cvar(x, 0.4, axis=1, lowest=False), [4.5, 45.0])
-    # 0.41 * 5 = 2.05, rounded up to three of five; 0.05 * 5 = 0.25 to one.
+    # 0.41 * 5 = 2.05 is rounded up to three of five values, and 0.05 * 5 = 0.25 to one value.
     np.testing.assert_array_equal(cvar(x, 0.41, axis=1), [2.0, 20.0])
     np.testing.assert_array_equal(cvar(x, axis=1), [1.0, 10.0])
-    # Of all ten: 1, 2, 3, 4.
+    # The lowest four of all ten values are 1, 2, 3 and 4.
     assert cvar(x, 0.4) == 2.5
     assert cvar(x, 1.0) == x.mean()
-    # 0.07 * 100 is 7.000000000000001 in double precision: seven values, 0 to 6.
+    # 0.07 * 100 is 7.000000000000001 in double precision, but counts as seven values, 0 to 6.
     assert cvar(np.arange(100.0), 0.07) == 3.0
-    # However small the share, one value is left.
+    # At least one value is left, however small the share is.
     assert cvar(np.arange(1.0, 9.0), 1e-12) == 1.0
 
 
 def test_cvar_finds_the_worst_of_many() -> None:
     x = np.random.default_rng(20).permutation(np.arange(10_000.0)).reshape(20, 500)
-    # The lowest 500 are 0, ..., 499, the highest 9500, ..., 9999.
+    # The lowest 500 values are 0, ..., 499, and the highest 500 values are 9500, ..., 9999.
     assert cvar(x) == 249.5
     assert cvar(x, lowest=False) == 9749.5
 
@@ -128,17 +129,17 @@ def test_interval_of_one_column_is_that_of_scipy() -> None:
         method="percentile",
         rng=2,
     )
-    # Both ends have their Monte Carlo error: sqrt(2) of one.
+    # Both intervals have a Monte Carlo error, so their difference has sqrt(2) times this error.
     error = math.sqrt(2) * _end_error(20_000, expected.standard_error)
     assert found.estimate == pytest.approx(stats.trim_mean(values, 0.25), abs=ROUNDING)
     assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
     assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
-    # The comparison means something: the error is a small part of the width.
+    # The error is a small part of the width, so the comparison is meaningful.
     assert 10 * error < found.high - found.low
 
 
 def test_interval_is_stratified_by_task() -> None:
-    # SciPy resamples several samples apart from each other: here the columns.
+    # SciPy resamples several samples independently of each other; here these are the columns.
     values = np.random.default_rng(3).normal(size=(12, 3)) * [1, 2, 3] + [0, 5, 1]
 
     def pooled(*columns: np.ndarray, axis: int) -> np.ndarray:
@@ -155,11 +156,12 @@ def test_interval_is_stratified_by_task() -> None:
 
 
 def _variance(values: np.ndarray, draw: str) -> float:
-    """Variance of the mean of a resample, worked out for each draw.
+    """Returns the variance of a resample's mean, worked out for each kind of draw.
 
-    A mean of n draws from a set has the variance of the set by n. Runs, then tasks: that between
-    the runs' means, and the mean of that within. Runs and tasks: the weights of rows and columns
-    are independent, so what is neither of a row nor of a column is drawn as n m values.
+    The mean of n draws from a set has the variance of the set divided by n. For `runs_then_tasks`,
+    the variance between the runs' means adds to the mean variance within runs. For
+    `runs_and_tasks`, the weights of rows and columns are independent. So the residuals, without the
+    effects of rows and columns, are drawn like n m values.
     """
     runs, tasks = values.shape
     by_run, by_task = values.mean(axis=1), values.mean(axis=0)
@@ -181,8 +183,9 @@ def test_each_draw_spreads_as_worked_out(draw) -> None:
     values = 1.2 * rows + columns + 3 * rest
     found = bootstrap(values, np.mean, draw=draw, resamples=20_000)
     sd = math.sqrt(_variance(values, draw))
-    # A width is off by 0.03 at most for 20,000 draws (0.076 sd at each end of 3.92 sd), and by 0.01
-    # since means of 12 draws or more are not quite normal. No two draws come nearer than 0.08.
+    # With 20,000 draws a width is off by at most 0.03 (0.076 sd at each end of 3.92 sd), and by
+    # another 0.01 because means of 12 draws or more are not quite normal. The widths of two kinds
+    # of draw differ by at least 0.08.
     expected = pytest.approx(2 * 1.96 * sd, rel=0.04)
     assert found.high - found.low == expected
     others = [2 * 1.96 * math.sqrt(_variance(values, other)) for other in DRAWS if other != draw]
@@ -213,8 +216,9 @@ def test_same_seed_same_interval() -> None:
 
 
 def test_ends_are_the_outer_draws() -> None:
-    # 81 resamples, 95 %: percentiles at 0.025 * 80 = 2 of the sorted ones, and at 78. With 90 they
-    # are at 2.225 and 86.775: taken are 2 and 87. The statistic numbers the resamples.
+    # With 81 resamples and 95 %, the percentiles are the sorted resamples 0.025 * 80 = 2 and 78.
+    # With 90 resamples they are at 2.225 and 86.775, so 2 and 87 are taken. The statistic returns
+    # the number of each resample.
     def number(x: np.ndarray, *, axis: tuple[int, int]) -> np.ndarray:
         return np.arange(len(x)) if x.ndim == 3 else np.mean(x, axis=axis)
 
@@ -226,7 +230,7 @@ def test_ends_are_the_outer_draws() -> None:
 def test_interval_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.random.default_rng(7).normal(size=(6, 4))
     whole = bootstrap(values, iqm, resamples=1000)
-    # Seven resamples at once, and six in the last block: the same draws, in other portions.
+    # A block has seven resamples, and the last block has six. The draws stay the same.
     monkeypatch.setattr(statistics, "BLOCK", 7 * 24)
     assert bootstrap(values, iqm, resamples=1000) == whole
 
@@ -239,14 +243,15 @@ def test_memory_is_bounded() -> None:
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    # All 2000 resamples at once would be 160 MB, and twice that with their indices.
+    # All 2000 resamples at once would take 160 MB, and twice as much with their indices.
     assert peak < 100e6
 
 
 def test_interval_covers_as_often_as_theory_says() -> None:
-    """The percentile interval of a mean is about mean +- 1.96 sd / sqrt(n), the sd without Bessel.
+    """The percentile interval of a mean is about mean +- 1.96 sd / sqrt(n).
 
-    It thus covers where |t| of n - 1 degrees of freedom is below 1.96 sqrt((n - 1) / n).
+    This sd has no Bessel correction. The interval thus covers the true mean if |t|, with n - 1
+    degrees of freedom, is below 1.96 sqrt((n - 1) / n).
     """
     random, runs, sets = np.random.default_rng(9), 10, 300
     covered = 0
@@ -256,21 +261,22 @@ def test_interval_covers_as_often_as_theory_says() -> None:
         covered += found.low <= 2.0 <= found.high
     share = 2 * stats.t.cdf(1.96 * math.sqrt((runs - 1) / runs), runs - 1) - 1
     assert share == pytest.approx(0.904, abs=0.001)
-    # Between the ends that a binomial of 300 passes once in 10,000 times each.
+    # A binomial count of 300 sets lies beyond each of these two ends once in 10,000 times.
     low, high = stats.binom.ppf([1e-4, 1 - 1e-4], sets, share)
     assert low <= covered <= high
 
 
 def test_shared_levels_take_draws_of_whole_tasks() -> None:
-    # Three runs that agree on every level know no more of the levels than one run does.
+    # Three runs that agree on every level contain no more information about levels than one run.
     levels = np.random.default_rng(10).normal(size=400)
     shared = bootstrap(np.tile(levels, (3, 1)), np.mean, draw="tasks")
     alone = bootstrap(levels[None], np.mean, draw="tasks")
     assert shared == pytest.approx(alone, abs=ROUNDING)
-    # Drawn apart they seem three times as many: narrower by sqrt(3).
+    # If levels are drawn separately for each run, there seem to be three times as many levels, so
+    # the interval is narrower by sqrt(3).
     apart = bootstrap(np.tile(levels, (3, 1)), np.mean, draw="tasks_per_run")
     narrower = (alone.high - alone.low) / (apart.high - apart.low)
-    # Two widths of 3.92 sd, four ends that are each off by 0.24 sd at most: sqrt(4) * 0.24 / 3.92.
+    # Two widths of 3.92 sd have four ends, each off by at most 0.24 sd: sqrt(4) * 0.24 / 3.92.
     assert narrower == pytest.approx(math.sqrt(3), rel=0.125)
 
 
@@ -282,8 +288,9 @@ def test_interval_of_infinite_values(finite: int) -> None:
         assert not np.isnan(found).any()
         assert found.low <= found.estimate <= found.high
     found = bootstrap(values, iqm)
-    # Two of ten are cut off either end. With 2 finite ones the draw is finite with 8 or more of
-    # them, probability 8e-5; with 7 infinite with 3 or more of 3 in 10, probability 0.62.
+    # Two of ten values are cut off at either end. With 2 finite values, a resample's mean is finite
+    # if at least 8 of its values are finite, which has a probability of 8e-5. With 7 finite values,
+    # it is infinite if at least 3 of its values are infinite, which has a probability of 0.62.
     assert math.isinf(found.low) is (finite == 2)
     assert math.isinf(found.estimate) is (finite != 10)
     assert math.isinf(found.high) is (finite != 10)
@@ -304,7 +311,7 @@ def test_interval_moves_and_stretches_with_the_values(values: np.ndarray, draw) 
     [
         ((5,), {}, "values has shape (5,): give [runs, tasks]"),
         ((0, 3), {}, "values is empty"),
-        ((2, 9), {}, "values has 2 runs: an interval over runs takes 3 or more"),
+        ((2, 9), {}, "values has 2 runs: an interval over runs needs 3 or more"),
         ((2, 9), {"draw": "runs"}, "values has 2 runs"),
         ((9, 2), {"draw": "tasks"}, "values has 2 tasks"),
         ((9, 2), {"draw": "runs_then_tasks"}, "values has 2 tasks"),
@@ -321,7 +328,7 @@ def test_bootstrap_refuses(shape, options, expected: str) -> None:
 def test_bootstrap_takes_the_least_there_may_be() -> None:
     assert bootstrap(np.ones((3, 1)), np.mean, resamples=40) == (1, 1, 1)
     assert bootstrap(np.ones((1, 3)), np.mean, draw="tasks", resamples=40) == (1, 1, 1)
-    # 20 * (1 - 0.9) is 1.9999999999999996 in double precision, and means 2.
+    # 20 * (1 - 0.9) is 1.9999999999999996 in double precision, but counts as 2.
     assert bootstrap(np.ones((3, 1)), np.mean, resamples=20, confidence=0.9) == (1, 1, 1)
 
 
@@ -364,7 +371,7 @@ def test_paired_is_what_scipy_pairs() -> None:
 @pytest.mark.parametrize("draw", DRAWS)
 def test_pairs_share_their_draws(draw) -> None:
     a = np.random.default_rng(13).normal(size=(4, 5))
-    # Every value gains a quarter, so that the difference has no spread, whatever is drawn.
+    # Every value gains 0.25, so the difference has no spread for any draw.
     assert paired(a, a + 0.25, iqm, draw=draw) == pytest.approx((0.25, 0.25, 0.25), abs=ROUNDING)
 
 
@@ -381,8 +388,8 @@ def test_paired_refuses() -> None:
 def test_improvement_by_hand() -> None:
     a = np.array([[1.0, 5.0], [2.0, 5.0], [3.0, 5.0]])
     b = np.array([[2.0, 4.0], [2.0, 5.0], [0.0, 6.0], [9.0, 6.0]])
-    # First task: 1 beats 0; 2 beats 0 and ties twice; 3 beats 2, 2, 0: (1 + 2 + 3) / 12. Second:
-    # each 5 beats 4 and ties once: 3 * 1.5 / 12.
+    # On the first task 1 beats 0, 2 beats 0 and ties twice, and 3 beats 2, 2 and 0:
+    # (1 + 2 + 3) / 12. On the second task each 5 beats 4 and ties once: 3 * 1.5 / 12.
     found = probability_of_improvement(a, b)
     assert found.estimate == pytest.approx((6 / 12 + 4.5 / 12) / 2, abs=ROUNDING)
     assert 0 <= found.low < found.estimate < found.high <= 1
@@ -392,7 +399,7 @@ def test_improvement_is_certain_where_all_are_better() -> None:
     a, b = np.array([[4.0], [5.0], [6.0]]), np.array([[1.0], [2.0], [3.0]])
     assert probability_of_improvement(a, b) == (1, 1, 1)
     assert probability_of_improvement(b, a) == (0, 0, 0)
-    # Never reached is worse than any number of steps, and a tie with itself.
+    # Infinite steps (never reached) are more than any number of steps, and tie with each other.
     never = np.full((3, 1), math.inf)
     assert probability_of_improvement(never, a) == (1, 1, 1)
     assert probability_of_improvement(never, never) == (0.5, 0.5, 0.5)
@@ -420,11 +427,11 @@ def test_improvement_interval_is_that_of_scipy() -> None:
         return (x[..., :, None] > y[..., None, :]).mean(axis=(-2, -1))
 
     found = probability_of_improvement(a[:, None], b[:, None], resamples=20_000)
-    # No value of a is one of b, so that resamples have no ties.
+    # No value of a is a value of b, so resamples have no ties.
     expected = stats.bootstrap(
         (a, b), improvement, vectorized=True, n_resamples=20_000, method="percentile", rng=15
     )
-    # Means of 15 * 20 pairs lie 1 / 300 apart, and an end falls on one of them.
+    # Means over 15 * 20 pairs are multiples of 1 / 300, and an end is one of these multiples.
     error = math.sqrt(2) * _end_error(20_000, expected.standard_error) + 1 / 300
     assert found.low == pytest.approx(expected.confidence_interval.low, abs=error)
     assert found.high == pytest.approx(expected.confidence_interval.high, abs=error)
@@ -432,14 +439,15 @@ def test_improvement_interval_is_that_of_scipy() -> None:
 
 
 def test_improvement_draws_runs_whole_or_by_task() -> None:
-    # Two tasks on which each run does the same: drawn whole, they are as one task.
+    # Each run does the same on all four tasks, so with whole runs they are like one task.
     random = np.random.default_rng(16)
     a, b = random.normal(size=(8, 1)), random.normal(size=(9, 1))
     one = probability_of_improvement(a, b, draw="runs")
     twice = probability_of_improvement(a.repeat(4, axis=1), b.repeat(4, axis=1), draw="runs")
     assert twice == pytest.approx(one, abs=ROUNDING)
-    # Drawn apart, four tasks seem to be independent: narrower by sqrt(4). Off by 0.12 at most for
-    # 2,000 draws (as above), and by 0.03 since those of one task lie 1 / 72 apart, the ends 0.5.
+    # If runs are drawn separately for each task, the four tasks seem independent, so the interval
+    # is narrower by sqrt(4). This factor is off by at most 0.12 for 2,000 draws (as above). It is
+    # off by another 0.03 because values of one task lie 1 / 72 apart, and the two ends 0.5 apart.
     apart = probability_of_improvement(a.repeat(4, axis=1), b.repeat(4, axis=1))
     narrower = (one.high - one.low) / (apart.high - apart.low)
     assert narrower == pytest.approx(2, rel=0.15)
@@ -452,8 +460,8 @@ def test_improvement_does_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(statistics, "BLOCK", 1)
     one_by_one = probability_of_improvement(a, b)
     assert one_by_one.estimate == whole.estimate
-    # The draws of a and b take turns, so that other blocks are other draws of the same: each end
-    # is off by its Monte Carlo error; the sd is a quarter of the width.
+    # The draws of a and b alternate, so other blocks give other draws from the same distribution.
+    # Each end is off by its Monte Carlo error; the sd is a quarter of the width.
     error = math.sqrt(2) * _end_error(2000, (whole.high - whole.low) / 4)
     assert one_by_one[1:] == pytest.approx(whole[1:], abs=error + 1 / 40)
 
@@ -471,7 +479,7 @@ def test_improvement_refuses() -> None:
 
 
 def test_improvement_over_levels_is_a_bootstrap_of_their_shares() -> None:
-    """One run of each on shared levels: P is the mean of 1, 1/2 or 0 a level."""
+    """With one run of each on shared levels, P is the mean of 1, 1/2 or 0 over the levels."""
     random = np.random.default_rng(19)
     a, b = random.integers(3, size=(1, 60)), random.integers(3, size=(1, 60))
     found = probability_of_improvement(a, b, draw="tasks", seed=5)
@@ -480,13 +488,14 @@ def test_improvement_over_levels_is_a_bootstrap_of_their_shares() -> None:
 
 
 def test_improvement_over_runs_and_levels_spreads_as_both() -> None:
-    """Where runs are all alike only levels spread, and where levels are alike only runs."""
+    """If all runs are equal, only levels cause spread; if all levels are equal, only runs do."""
     random = np.random.default_rng(20)
     levels = random.normal(size=(1, 50))
     a, b = levels.repeat(3, axis=0), np.zeros((4, 50))
     both = probability_of_improvement(a, b, draw="runs_and_tasks", seed=6)
     alone = probability_of_improvement(a[:1], b[:1], draw="tasks", seed=6)
-    # Other draws of the same: the sd is a quarter of the width, and values come in steps of 1/50.
+    # The draws differ but have the same distribution. The sd is a quarter of the width, and values
+    # come in steps of 1/50.
     error = math.sqrt(2) * _end_error(2000, (alone.high - alone.low) / 4)
     assert both[1:] == pytest.approx(alone[1:], abs=error + 1 / 50)
     runs = random.normal(size=(7, 1)).repeat(50, axis=1)
@@ -500,7 +509,10 @@ def test_improvement_over_runs_and_levels_spreads_as_both() -> None:
 
 
 def test_tasks_are_drawn_within_their_strata() -> None:
-    """Where all of a stratum are alike nothing spreads, however far strata are apart."""
+    """If the values within each stratum are equal, the interval has no width.
+
+    This holds however far apart the strata are.
+    """
     values = np.repeat([0.0, 5.0, 7.0], [4, 3, 5])[None]
     found = bootstrap(values, np.mean, draw="tasks", strata=[4, 3, 5])
     assert found == pytest.approx((values.mean(),) * 3)
@@ -553,7 +565,8 @@ def test_curve_is_an_interval_at_each_point() -> None:
 
 
 def test_curve_draws_runs_with_all_their_points() -> None:
-    # The second point is twice the first of every run, so that its band is, end by end.
+    # In every run the second point is twice the first, so each end of its band is also twice the
+    # first point's end.
     values = np.random.default_rng(19).normal(size=(6, 1)) * [1.0, 2.0]
     found = curve(values)
     assert found.low[1] == pytest.approx(2 * found.low[0], abs=ROUNDING)
@@ -568,23 +581,24 @@ def test_curve_refuses() -> None:
 
 
 def test_area_by_hand() -> None:
-    # From 0 to 10: 1 to 3 in 4 steps, area 8; 3 to 0 in 6 steps, area 9; together 17 over 10.
+    # From 1 to 3 in 4 steps the area is 8, and from 3 to 0 in 6 steps it is 9: 17 over 10 steps.
     values = [[1.0, 3.0, 0.0], [2.0, 2.0, 2.0]]
     np.testing.assert_allclose(area_under([0, 4, 10], values), [1.7, 2.0], rtol=0, atol=ROUNDING)
     assert area_under([100, 104, 110], values[0]) == pytest.approx(1.7, abs=ROUNDING)
 
 
 def test_steps_to_by_hand() -> None:
+    # A curve may fall below 0.6 again after it has first reached 0.6.
     curves = [
-        [0.0, 0.4, 0.8, 0.2],  # 0.6 half way from 0.4 to 0.8: 10 + 0.5 * 20; later left again
-        [0.0, 0.6, 0.6, 0.6],  # at the point itself
-        [0.7, 0.0, 0.0, 0.9],  # from the first step on
-        [0.0, 0.1, 0.2, 0.3],  # never
-        [0.5, 0.5, 0.5, 0.7],  # half way from 30 to 40
+        [0.0, 0.4, 0.8, 0.2],  # 0.6 is half way from 0.4 to 0.8: 10 + 0.5 * 20.
+        [0.0, 0.6, 0.6, 0.6],  # At the point itself.
+        [0.7, 0.0, 0.0, 0.9],  # From the first step on.
+        [0.0, 0.1, 0.2, 0.3],  # Never.
+        [0.5, 0.5, 0.5, 0.7],  # 0.6 is half way from 0.5 to 0.7: 30 + 0.5 * 10
     ]
     found = steps_to([0, 10, 30, 40], curves, 0.6)
     np.testing.assert_allclose(found, [20, 10, 0, math.inf, 35], rtol=0, atol=ROUNDING)
-    # Of 0, 10, 20, 35, inf one comes off either end: (10 + 20 + 35) / 3.
+    # Of 0, 10, 20, 35 and inf, one value is cut off at either end: (10 + 20 + 35) / 3.
     assert iqm(found) == pytest.approx(65 / 3, abs=ROUNDING)
 
 
@@ -597,7 +611,8 @@ def test_steps_to_is_where_the_curve_first_is_at_the_threshold(values, threshold
         assert values.max() < threshold
     else:
         assert (values[steps < found - ROUNDING * 100] < threshold).all()
-        # Steps go up to 126 and slopes to 200 a step: an error of 1e-14 of the steps, times 200.
+        # Steps go up to 126 and slopes up to 200 per step, so an error of 1e-14 of the steps is
+        # multiplied by 200.
         height = np.interp(found, steps, values)
         expected = max(threshold, values[0])
         assert height == pytest.approx(expected, abs=1e-9)

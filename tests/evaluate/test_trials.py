@@ -1,4 +1,4 @@
-"""Processes that judge: what becomes of them when the one that began them dies."""
+"""Checks that judging processes end when the process that started them is killed."""
 
 import os
 import subprocess

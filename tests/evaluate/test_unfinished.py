@@ -1,4 +1,4 @@
-"""Evaluations that are stopped between two cells and go on, and cells with a step limit."""
+"""Tests evaluations that resume after a stop between two cells, and cells with a step limit."""
 
 import csv
 import json
@@ -20,7 +20,7 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
 
-# Judges, and sends itself a signal when the first cell has been written.
+# This script judges, and sends itself a signal once the first cell has been written.
 STOPPED = """
 import os, signal, sys
 from swarmjax.evaluate import __main__, unfinished
@@ -35,7 +35,7 @@ sys.exit(__main__.main(sys.argv[2:]))
 
 
 def _suite(path: Path, steps: int | None = None, seed: int = 1000002) -> Path:
-    """Writes a suite of two small cells, of which the second may have a step limit."""
+    """Writes a suite of two small cells; the second cell may have a step limit."""
     limit = "" if steps is None else f", steps: {steps}"
     path.with_suffix(".yaml").write_text(
         "name: tiny\ncells:\n"
@@ -49,7 +49,7 @@ def _suite(path: Path, steps: int | None = None, seed: int = 1000002) -> Path:
 
 @pytest.fixture
 def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Of an evaluation in the working directory, but for `out`."""
+    """Returns the words of an evaluation in the working directory, without `out`."""
     monkeypatch.chdir(tmp_path)
     steering.write(Path("policy.npz"))
     _suite(Path("tiny.npz"))
@@ -91,7 +91,7 @@ def test_the_same_command_goes_on_after_a_stop(
     if number == signal.SIGINT:
         assert stopped.stderr == (
             "swarmjax.evaluate: interrupted, 1 cell is in stopped/unfinished, and the same command "
-            "goes on.\n"
+            "continues with the rest.\n"
         )
     judged, run_each = [], evaluate_trials.run_each
 
@@ -112,7 +112,7 @@ def test_the_same_command_goes_on_after_a_stop(
 def test_a_file_alone_goes_on_too(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     _stop([*words, "out=stopped.json"])
     assert Path("stopped.json.unfinished/cell0.npz").exists()
-    # How many processes work, and which of two copies of a policy, is nothing that is judged.
+    # The number of processes changes no result, so it may differ when an evaluation resumes.
     assert _command(monkeypatch, *words, "workers=2", "out=stopped.json") == 0
     assert _command(monkeypatch, *words, "out=whole.json") == 0
     assert Path("stopped.json").read_bytes() == Path("whole.json").read_bytes()
@@ -172,7 +172,7 @@ def test_a_damaged_cell_is_refused_in_one_sentence(
 def test_a_cell_has_a_step_limit_of_its_own(
     words: list[str], monkeypatch: pytest.MonkeyPatch, typed: list[str], limits: list[int]
 ) -> None:
-    """Robots that stay where they are take all the time that there is."""
+    """Robots that stay at their start use up the whole step limit."""
     steering.write(Path("policy.npz"), drive=steering.STAY)
     _suite(Path("tiny.npz"), steps=70)
     few = [word for word in words if not word.startswith("steps=")]

@@ -1,4 +1,4 @@
-"""A policy says as what it is judged, unless the command line says otherwise."""
+"""Checks that a policy is judged with its training settings unless the command line differs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +79,7 @@ def test_the_history_is_that_of_training_and_no_other(tmp_path: Path) -> None:
     for value in (1, 4):
         assert refusal(_load, word, f"task.history={value}") == (
             f"task.history is {value}, but {tmp_path / 'three.npz'} was trained with 3: leave "
-            "task.history out, since each policy is judged with its own."
+            "task.history out, since each policy is judged with the value that it was trained with."
         )
     assert "was trained with 1" in refusal(
         _load, _policy(tmp_path / "one.npz", "stage=s3"), "task.history=3"

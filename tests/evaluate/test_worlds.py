@@ -1,4 +1,4 @@
-"""Worlds with walls in both judges: what rays meet, and levels whose walls differ in size."""
+"""Tests worlds with walls in both judges: rays that hit walls, and walls of different sizes."""
 
 from pathlib import Path
 
@@ -51,12 +51,12 @@ def test_rays_meet_walls_where_mujoco_meets_them(tmp_path: Path, name: str) -> N
     drawn = Level(*stacked)
     found = infrared.distances(drawn.start, drawn.side, drawn.obstacle, HULL, RANGE, jnp)
     assert ((seen > 0.0) & (seen < RANGE)).sum() > 50
-    # Float32 rounds positions of up to 0.8 m to 6e-8 m, and a slanted ray stretches that.
+    # Float32 rounds positions of up to 0.8 m to 6e-8 m, and a slanted ray magnifies this error.
     np.testing.assert_allclose(found, seen, rtol=0, atol=1e-6)
 
 
 def _beside_walls(drawn: Level, random: np.random.Generator) -> Level:
-    """Puts robots beside the long faces of walls, as near as rays reach, where they have room."""
+    """Moves robots beside long faces of walls, within range of their rays, where there is room."""
     boxes = drawn.obstacle[drawn.obstacle_present]
     start = drawn.start.copy()
     for robot in range(len(start)):

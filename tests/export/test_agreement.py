@@ -23,14 +23,15 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.task.config import NeighboursConfig
 
 OBSERVATIONS = 10_000
-# What is asked for. Sums of 64 float32 terms differ in their order alone: actions up to 2.5 units
-# (tanh) by 1.1e-6, those up to 16 (relu, swish) by 8.2e-6, where 2 units span all commands.
+# The required agreement. Sums of 64 float32 terms differ only in their order. This changes actions
+# of up to 2.5 units (tanh) by 1.1e-6, and actions of up to 16 units (relu, swish) by 8.2e-6. The
+# full range of commands is 2 units.
 TOLERANCE = 1e-5
 Activation = Literal["tanh", "relu", "swish"]
 
 
 def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.ndarray:
-    """Actions [B, R, U] of the networks that were trained, robot i by learner i."""
+    """Returns actions [B, R, U] of the Flax networks; learner i drives robot i."""
     config = AlgoConfig(activation=activation)
 
     def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
@@ -104,7 +105,7 @@ STEPS, MEMORY, HISTORY = 1_000, 16, 5
 
 
 def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Actions [T, R, U] of the networks that were trained, through all steps at once."""
+    """Returns actions [T, R, U] of the Flax networks with a memory, for all steps in one call."""
     config = AlgoConfig(memory="gru", memory_size=MEMORY)
 
     def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
@@ -129,7 +130,10 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
 
 
 def _by_flax_stacked(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Likewise of observations that are stacked by hand, zeros before the episode."""
+    """Returns actions [T, R, U] of the Flax networks for observations stacked by hand.
+
+    Observations before the start of an episode are zeros.
+    """
     since = np.arange(len(seen)) - np.maximum.accumulate(np.where(begins, np.arange(len(seen)), 0))
     looks = [
         np.where((since >= age)[:, None, None], np.roll(seen, age, axis=0), 0.0)
@@ -199,9 +203,9 @@ def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
     }
     for name, action in found.items():
         assert action.dtype == np.float32
-        # The memory forgets: differences of one step do not add up over a thousand.
+        # The memory forgets, so differences of single steps do not add up over a thousand steps.
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
-    # And it matters: the same observations after others, or none, give other actions.
+    # The memory matters: if it is reset at every step, the same observations give other actions.
     assert np.abs(expected - _by_numpy_steps(trained, seen, begins | True)).max() > 0.1
 
 
@@ -209,7 +213,7 @@ HEARD, SAID = 3, 2
 
 
 def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.ndarray) -> np.ndarray:
-    """Actions [T, R, U] of the networks that were trained, with a memory or without."""
+    """Returns actions [T, R, U] of the Flax networks that hear, with or without a memory."""
     memory = {"memory": "gru", "memory_size": MEMORY} if kind == "gru" else {}
     size, heard = seen.shape[-1], NeighboursConfig(count=HEARD, message_size=SAID)
     config = networks.bind_hearing(AlgoConfig(**memory), size, heard.count, heard.width)

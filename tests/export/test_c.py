@@ -1,4 +1,4 @@
-"""The C files: they build without a warning, hold themselves to NumPy, and fit on the robot."""
+"""Checks that the C files build without a warning, agree with NumPy, and fit on the robot."""
 
 import ctypes
 import re
@@ -100,7 +100,7 @@ def test_the_self_test_notices_a_changed_weight(tmp_path: Path) -> None:
     changed = source.replace(f"{bias[1]}f", f"{float(bias[1]) + 1e-4!r}f")
     (folder / "policy.c").write_text(changed)
     _run(folder, "gcc", "-std=c99", "policy.c", "policy_test.c", "-lm", "-o", "self_test")
-    assert _run(folder, "./self_test").returncode == 1  # the first case
+    assert _run(folder, "./self_test").returncode == 1  # the first case fails
 
 
 @needs_gcc
@@ -111,7 +111,7 @@ def test_make_builds_and_runs_the_self_test(tmp_path: Path) -> None:
     made = _run(folder, "make", "test")
     assert (made.returncode, made.stderr) == (0, "")
     assert made.stdout.endswith("policy_test: all actions agree\n")
-    export_folder.check_folder(folder)  # what was built does not keep an export from coming again
+    export_folder.check_folder(folder)  # built files do not prevent another export
 
 
 @needs_gcc
@@ -132,14 +132,14 @@ def test_from_quantities_to_wheel_speeds(tmp_path: Path) -> None:
 
     quantity = draw.uniform(0, 500, (50, observation.SIZE)).astype(np.float32)
     expected = (quantity - np.float32(layout["offset"])) / np.float32(layout["scale"])
-    # The same operations on the same float32 numbers, here and in the two below.
+    # C does the same operations on the same float32 numbers, here and in the two checks below.
     np.testing.assert_array_equal(call("policy_observe", quantity, observation.SIZE), expected)
     action = draw.normal(size=(50, 2)).astype(np.float32)
     command = policy.command(trained, action)
     np.testing.assert_array_equal(call("policy_command", action, 2), command)
     robot = drive.from_config(RobotConfig())
     wheels = drive.wheel_speeds(command, robot, np)
-    assert (np.abs(wheels) == np.float32(epuck.MAX_WHEEL_SPEED)).any()  # the clamp is there
+    assert (np.abs(wheels) == np.float32(epuck.MAX_WHEEL_SPEED)).any()  # some speeds are clamped
     np.testing.assert_allclose(call("policy_wheel_speeds", command, 2), wheels, rtol=1e-6)
 
 
@@ -152,15 +152,17 @@ def test_it_fits_on_a_cortex_m4f(tmp_path: Path) -> None:
     assert (built.returncode, built.stderr) == (0, "")
     listed = _run(folder, "arm-none-eabi-size", "policy.o").stdout.splitlines()[1].split()
     text, data, bss = (int(word) for word in listed[:3])
-    assert (data, bss) == (0, 0)  # RAM is used on the stack alone
-    # Two layers of 64 between inputs and 2, the normaliser's and the scaling's two numbers each.
+    assert (data, bss) == (0, 0)  # RAM is used only on the stack.
+    # The network has two layers of 64 units and 2 outputs. The normaliser and the scaling have two
+    # numbers per input each.
     size = observation.SIZE
     floats = size * 64 + 64 + 64 * 64 + 64 + 64 * 2 + 2 + 2 * size + 2 * size
     assert 4 * floats < text < 4 * floats + 1024
     stack = (folder / "policy.su").read_text()
     used = {line.split()[0].split(":")[-1]: int(line.split()[1]) for line in stack.splitlines()}
     assert 2 * 64 * 4 <= used["policy_action"] < 2 * 64 * 4 + 128
-    # The whole self-test links with newlib, and asks of libm for no function in double precision.
+    # The whole self-test links with newlib, and the policy calls no double-precision function of
+    # libm.
     whole = _run(
         folder, *gcc, "--specs=nosys.specs", "policy.c", "policy_test.c", "-lm", "-o", "t.elf"
     )

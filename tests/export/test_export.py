@@ -1,4 +1,4 @@
-"""The command that exports: which policy, in which form, where to, and what it refuses."""
+"""Tests the command that exports: choice of policy, format, output path, and refused settings."""
 
 import hashlib
 import json
@@ -56,7 +56,7 @@ def test_a_policy_file_is_exported_beside_itself(
     out = tmp_path / FORMATS[form]
     assert capsys.readouterr().out == f"{out}: the policy of {path}.\n"
     assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", FORMATS[form]}
-    # Once more, somewhere else and in the same place: the same bytes.
+    # Exports to a second place, and again to the same place, give the same bytes.
     other = tmp_path / "other" / FORMATS[form]
     assert export.main([f"policy={path}", f"format={form}", f"out={other}"]) == 0
     once = _digests(tmp_path / "other")
@@ -96,7 +96,7 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     assert said["observation"]["encoding"] == "metric"
     assert (said["update"], said["seed"]) == (7, 4)
     assert build(TrainConfig, said["config"]) == trained
-    policy_file.write(tmp_path / "policy.npz", policies.arrays(), said)  # refuses nothing of it
+    policy_file.write(tmp_path / "policy.npz", policies.arrays(), said)  # accepts all of it
 
 
 @pytest.mark.parametrize(
@@ -137,11 +137,12 @@ def test_export_refuses(
         (given, "format=c", f"out={tmp_path / 'file'}"): "file, a file: give a folder.",
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
-        (given, "format=c", "out=."): "out is ., which has no name of its own: give another name.",
-        (given, "format=webots", "out=a/.."): "out is a/.., which has no name of its own: give ",
+        (given, "format=c", "out=."): "out is ., which does not end with a name: add the name of ",
+        (given, "format=webots", "out=a/.."): "out is a/.., which does not end with a name: add ",
         **{
             (given, "format=webots", f"out={tmp_path / name}"): (
-                f"{name}, whose name is also the controller's, but it imports a module of that name"
+                f"{name}, whose name is also the controller's, but the controller imports a module "
+                "of that name: give another name"
             )
             for name in ("policy", "controller", "numpy", "json", "random", "zipfile")
         },
@@ -157,7 +158,7 @@ def test_export_says_what_onnx_needs(
 ) -> None:
     path = tmp_path / "policy.npz"
     saved(path)
-    monkeypatch.setitem(sys.modules, "onnx", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "onnx", None)  # as if onnx were not installed
     sentence = _refusal(monkeypatch, capsys, f"policy={path}", "format=onnx")
     assert "the package onnx is not installed: run uv sync --extra onnx." in sentence
     assert [found.name for found in tmp_path.iterdir()] == ["policy.npz"]
@@ -203,7 +204,7 @@ def test_a_folder_is_replaced_only_as_it_was_exported(tmp_path: Path) -> None:
         == {"a": b"3"}  # fmt: skip
     assert json.loads((out / "export.json").read_text()) == {"a": hashlib.sha256(b"3").hexdigest()}
     (out / "a").write_bytes(b"changed by hand")
-    with pytest.raises(ConfigError, match=r"out, where a is not as an export wrote it: "):
+    with pytest.raises(ConfigError, match=r"out, where a is not from an export or was "):
         export_folder.write_folder(out, {"a": b"4"})
     assert (out / "a").read_bytes() == b"changed by hand"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -217,7 +218,7 @@ def test_a_folder_of_somebody_elses_is_left_alone(
     name: str, content: bytes, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not as an export wrote"):
+    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not from an export"):
         export_folder.write_folder(tmp_path, {"a": b"1"})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {name: content}
 
@@ -228,7 +229,7 @@ def test_a_link_in_an_export_is_not_followed(tmp_path: Path) -> None:
     precious.write_bytes(b"1")
     (out / "a").unlink()
     (out / "a").symlink_to(precious)
-    with pytest.raises(ConfigError, match=r", where a is not as an export wrote it"):
+    with pytest.raises(ConfigError, match=r", where a is not from an export or was"):
         export_folder.write_folder(out, {"a": b"2"})
 
 

@@ -1,4 +1,4 @@
-"""The ONNX file: a sound model that says what goes in and comes out."""
+"""Checks that the ONNX file holds a valid model that describes its inputs and outputs."""
 
 import json
 from pathlib import Path
@@ -34,9 +34,9 @@ def test_the_model_is_sound_and_runs_any_batch(learners: int, tmp_path: Path) ->
         expected = policy.act(trained, seen)
         fed = seen[:, 0] if learners == 1 else seen
         action, command = session.run(None, {"observation": fed})
-        # Sums of few terms, in another order; actions are below 4.
+        # Sums of a few terms are added in another order; actions are below 4.
         np.testing.assert_allclose(action.reshape(expected.shape), expected, atol=2e-6)
-        # Ranges of 6.28 rad/s, of which the action is off by 2e-6 / 2.
+        # A command has a range of up to 6.28 rad/s, and an action is off by 2e-6 in a range of 2.
         np.testing.assert_allclose(
             command.reshape(expected.shape), policy.command(trained, expected), atol=7e-6
         )

@@ -1,4 +1,4 @@
-"""The Webots controller, run as Webots would run it, against a stand-in of Webots' package."""
+"""Tests the Webots controller, run as Webots runs it, with a stand-in for Webots' package."""
 
 import json
 import math
@@ -27,12 +27,12 @@ from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors, observation
 from swarmjax.task.config import TaskConfig
 
-NAMES = webots_controller.QUANTITIES  # what the controller can measure, and these policies observe
+NAMES = webots_controller.QUANTITIES  # measured by the controller, observed by these policies
 METRIC, WEBOTS = policies.observed("metric", NAMES), policies.observed("webots", NAMES)
 
-# What a controller sees of Webots: written from the manual's names and units. It plays a script,
+# A stand-in for Webots' package, written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],
-# "compass": [3], "custom": text}, ..]}, and writes down what the motors are told.
+# "compass": [3], "custom": text}, ..]}, and records the commands to the motors.
 STAND_IN = """
 import json, math, pathlib
 
@@ -120,7 +120,7 @@ def _exported(tmp_path: Path, *words: str, **changes: Any) -> tuple[Policy, Path
 def _simulate(
     folder: Path, steps: list[dict[str, Any]], *words: str, basic: float = 32.0, **script: Any
 ) -> subprocess.CompletedProcess[str]:
-    """Runs the controller in its folder, as Webots does, with nothing of this project near."""
+    """Runs the controller in its folder, as Webots does, with only the stand-in on PYTHONPATH."""
     beside = folder.parent / "webots"
     beside.mkdir(exist_ok=True)
     (beside / "controller.py").write_text(STAND_IN)
@@ -137,14 +137,14 @@ def _simulate(
 
 
 def _told(folder: Path, steps: int) -> np.ndarray:
-    """Speeds [steps, 2] that the wheels were told, each once a step."""
+    """Returns the commanded wheel speeds [steps, 2]; checks that each step has one per wheel."""
     told = [row for row in json.loads((folder / "told.json").read_text()) if row[0] >= 0]
     assert [row[:2] for row in told] == [[i, side] for i in range(steps) for side in (0, 1)]
     return np.array([row[2] for row in told]).reshape(steps, 2)
 
 
 class Scene(NamedTuple):
-    """Where a robot is, and the rays of its sensors there."""
+    """A robot's pose, and the lengths of its sensors' rays at this pose."""
 
     pose: np.ndarray  # [3] x, y (m), yaw (rad)
     ray: np.ndarray  # [K] m
@@ -156,7 +156,7 @@ def _scene(draw: np.random.Generator) -> Scene:
 
 
 def _script(scene: Scene, answers: Literal["webots", "real"]) -> dict[str, Any]:
-    """What the devices of a robot report there."""
+    """Returns the readings of a robot's devices in a scene."""
     x, y, yaw = scene.pose.tolist()
     return {
         "counts": response.expected(answers, scene.ray, np).tolist(),
@@ -172,7 +172,7 @@ def _chain(
     scenes: list[Scene],
     target: tuple[float, float],
 ) -> np.ndarray:
-    """Wheel speeds [T, R, 2] that `evaluate` comes to there, with sensors of that response."""
+    """Returns the wheel speeds [T, R, 2] of `evaluate` in the scenes, with these sensors."""
     pose, ray = (np.array(part)[:, None] for part in zip(*scenes, strict=True))
     realism = RealismConfig(infrared=answers)
     electronics = task_electronics.load(TaskConfig(), realism, encoding=trained.encoding)
@@ -204,17 +204,18 @@ def test_the_wheels_turn_as_they_do_in_the_judge(
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     found = _told(folder, len(scenes))
     expected = _chain(trained, answers, scenes, target)[:, -1]
-    assert np.ptp(expected, axis=0).min() > 1.0  # rad/s; what is sensed matters
-    assert (np.abs(expected) == np.float32(epuck.MAX_WHEEL_SPEED)).any()  # and the clamp
-    # Rays and the target's bearing are worked out in float64 here and in float32 by the judge, to
-    # within 2**-23 of 4 rad or 1e-7 m of 6e-3 in a deviation: 2e-5 of what the policy sees, which
-    # a network of gains near 1 hands on, times some 6 rad/s.
+    assert np.ptp(expected, axis=0).min() > 1.0  # rad/s; the readings change the speeds.
+    assert (np.abs(expected) == np.float32(epuck.MAX_WHEEL_SPEED)).any()  # Some are clamped.
+    # The controller computes rays and the target's bearing in float64, and the judge computes them
+    # in float32. They differ by 2**-23 of 4 rad, or by 1e-7 m where the normaliser's deviation is
+    # 6e-3 m. That is 2e-5 of a policy's input. A network with gains near 1 passes it on, times
+    # about 6 rad/s.
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_a_robot_draws_its_actions_from_the_policy(tmp_path: Path) -> None:
     given = policies.arrays(hidden=(16, 16), names=NAMES)
-    given["actor/log_std"][:] = np.log([0.1, 0.02])  # too little to meet a limit of the command
+    given["actor/log_std"][:] = np.log([0.1, 0.02])  # too small to reach a limit of the command
     given["actor/mean/kernel"][:] = 0.0
     given["actor/mean/bias"][:] = 0.0
     trained = saved(tmp_path / "policy.npz", given, observation=METRIC)
@@ -226,8 +227,9 @@ def test_a_robot_draws_its_actions_from_the_policy(tmp_path: Path) -> None:
     body = trained.meta["robot"]
     speed = 0.5 * (left + right) * body["wheel_radius"]
     turn = (right - left) * body["wheel_radius"] / body["track"]
-    # An action of 0 is half the speed and no turn. The error of a deviation measured on 2,000 draws
-    # is 1 / sqrt(4000) = 1.6 %, that of a mean a deviation over sqrt(2000); five times that.
+    # An action of 0 is half the speed and no turn. A deviation measured on 2,000 draws has a
+    # standard error of 1 / sqrt(4000) = 1.6 %. A mean has a standard error of the deviation divided
+    # by sqrt(2000). The tolerances are five times these errors.
     for found, mean, deviation in (
         (speed, 0.5 * trained.max_speed, 0.1 * 0.5 * trained.max_speed),
         (turn, 0.0, 0.02 * trained.max_turn_rate),
@@ -248,7 +250,7 @@ def test_a_robot_stays_where_it_has_arrived_until_its_target_moves(tmp_path: Pat
     done = _simulate(folder, steps)
     assert (done.returncode, done.stderr) == (0, "")
     moving = np.abs(_told(folder, len(steps))).max(axis=1) > 0
-    # It stops below 0.05 m and stays; then it has another target, then none.
+    # The robot stops below 0.05 m and stays. Then it gets another target, and then no target.
     assert moving.tolist() == [True, True, True, False, False, True, False]
 
 
@@ -279,9 +281,9 @@ def test_a_robot_remembers_until_it_has_another_target_or_number(
     done = _simulate(folder, [still | {"custom": word} for word in told], "action=mean")
     assert (done.returncode, done.stderr) == (0, "")
     wheels = _told(folder, len(told))
-    # The same is seen at each step: what differs is what is remembered.
+    # The observations are the same at each step, so differences come from the memory.
     assert np.abs(wheels[1] - wheels[0]).max() > 1e-3
-    np.testing.assert_allclose(wheels[3], wheels[0], atol=1e-2)  # 0.1 mm of 0.5 m
+    np.testing.assert_allclose(wheels[3], wheels[0], atol=1e-2)  # target moved by 0.1 mm of 0.5 m
     np.testing.assert_allclose(wheels[4], wheels[1], atol=1e-2)
     if learners == 1:
         np.testing.assert_array_equal(wheels[5], wheels[0])
@@ -309,7 +311,7 @@ def test_the_robots_number_may_be_in_custom_data(tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
         found[custom] = _told(folder, 1)[0].tolist()
     first, *others = found.values()
-    assert others == [others[0]] * 3  # robot 2, whom controllerArgs name if they name one
+    assert others == [others[0]] * 3  # robot 2; controllerArgs win over custom data
     assert first != others[0]
 
 
@@ -366,8 +368,8 @@ def test_counts_become_metres_by_the_inverse_of_the_response(
     told = json.loads(json.dumps(webots.sensors(answers)))
     found = webots_controller.ray(np.array(counts), told)
     expected = response.distance(answers, np.array(counts), np)
-    # The fit of the real sensors is kept in float32 there: 2**-24 of some 0.1 m, over a curve that
-    # is steepest, 1 m a count, where a count is 1.
+    # `response` keeps the fit of the real sensors in float32, which is off by 2**-24 of about
+    # 0.1 m. The curve is steepest at 1 count, with 1 m per count.
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""What clusters and clouds are given: bash, YAML and a Dockerfile, checked without either."""
+"""Checks the bash, YAML and Dockerfile of launch/ without any cluster or cloud."""
 
 import copy
 import json
@@ -42,7 +42,7 @@ def _job() -> Any:
 
 
 def _lint(*arguments: str, script: str | None = None) -> str:
-    """Runs shellcheck; returns what it found."""
+    """Runs shellcheck and returns its findings."""
     command = [str(Path(sys.executable).with_name("shellcheck")), *arguments]
     done = subprocess.run(command, input=script, capture_output=True, text=True, check=False)
     return done.stdout + done.stderr
@@ -93,7 +93,7 @@ def test_a_schema_refuses_what_is_not_published(name: str, place: list, value: o
 
 
 def _command(container: dict, index: int) -> list[str]:
-    """Fills the variables of a container's arguments in, as Kubernetes does."""
+    """Substitutes the variables in a container's arguments, as Kubernetes does."""
     values = {each["name"]: each["value"] for each in container["env"]}
     values["JOB_COMPLETION_INDEX"] = str(index)
     return [
@@ -113,7 +113,7 @@ def test_the_pods_of_a_jobset_are_the_processes_of_one_run() -> None:
     host = f"{name}-{replicated['name']}-0-0.{name}"
     assert run == (f"{host}:12355", job["completions"], job["completions"])
     assert train["resources"]["limits"]["nvidia.com/gpu"] == 1
-    assert "command" not in train  # the image's own, see below
+    assert "command" not in train  # so the image's entry point runs, which is tested below
     assert _mounted(settings[0], [mount["mountPath"] for mount in train["volumeMounts"]])
 
 
@@ -179,14 +179,14 @@ def test_the_nodes_of_a_cloud_are_the_processes_of_one_run(tmp_path: Path) -> No
 
 
 def _dockerfile() -> list[tuple[str, str]]:
-    """Instructions of the Dockerfile with what stands behind them."""
+    """Returns the instructions of the Dockerfile, each with its arguments."""
     lines = (LAUNCH / "Dockerfile").read_text().splitlines()
     found = (line.partition(" ") for line in lines if line and not line.startswith("#"))
     return [(name, rest) for name, _, rest in found]
 
 
 def _copied() -> list[tuple[str, str]]:
-    """What the Dockerfile copies, and to where."""
+    """Returns the source and the destination of everything that the Dockerfile copies."""
     copies = [rest.split() for name, rest in _dockerfile() if name == "COPY"]
     return [(source, words[-1]) for words in copies for source in words[:-1]]
 
@@ -194,7 +194,7 @@ def _copied() -> list[tuple[str, str]]:
 def test_an_image_begins_with_training_and_belongs_to_no_root() -> None:
     instructions = dict(_dockerfile())
     assert json.loads(instructions["ENTRYPOINT"]) == ["python", "-m", "swarmjax.train"]
-    assert instructions["USER"].isdecimal()  # Kubernetes cannot tell whether a name is root's
+    assert instructions["USER"].isdecimal()  # Kubernetes cannot tell if a user's name means root
     assert int(instructions["USER"]) == _pod()["securityContext"]["runAsUser"] > 0
     assert f"python:{(ROOT / '.python-version').read_text().strip()}-slim" == instructions["FROM"]
 

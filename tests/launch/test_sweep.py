@@ -1,4 +1,4 @@
-"""`launch/sweep.py`, in submitit's debug executor and under a stand-in for Slurm."""
+"""Tests `launch/sweep.py` in submitit's debug executor and with stand-ins for Slurm."""
 
 import importlib.util
 import json
@@ -16,7 +16,7 @@ from swarmjax import command
 from swarmjax.config import section
 from swarmjax.run.settings import TrainConfig
 
-# Of log files that submitit's debug executor leaves open.
+# Submitit's debug executor leaves log files open, which raises these warnings.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
@@ -52,7 +52,10 @@ def quick(sweep: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 def _stand_in(
     monkeypatch: pytest.MonkeyPatch, sweep: Any, codes: dict[str, list[int]]
 ) -> list[str]:
-    """Puts exit codes, by arenas, in the place of training; returns what is asked to train."""
+    """Replaces training by a stand-in that returns the given exit codes of each `arenas=N`.
+
+    Returns a list to which the stand-in adds the `arenas=N` of each call.
+    """
     asked = []
 
     def train(words: Sequence[str], _: str | None) -> int:
@@ -117,7 +120,7 @@ def test_a_job_that_fails_is_named_and_keeps_no_other_from_training(
 
 
 class _Job:
-    """A job that has been killed, or one that goes on."""
+    """A stand-in for a job that was killed (`dead`) or is still running."""
 
     def __init__(self, *, dead: bool) -> None:
         self.job_id, self.cancelled, self._dead = "7", False, dead

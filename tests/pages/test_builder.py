@@ -1,4 +1,4 @@
-"""The frame of every page: what it escapes, what it lets a browser load, what it refuses."""
+"""Checks the frame of every page: escapes, what a browser may load, and refusals."""
 
 import base64
 import hashlib
@@ -18,12 +18,12 @@ RUNS = {"title": "a title", "heads": ["a"], "rows": [], "note": "a note", "comma
 
 
 def _table(**given: object) -> str:
-    """The page of a table, the smallest there is."""
+    """Returns the page of a table, which is the smallest page."""
     return builder.render("report/runs.html", **(RUNS | given))
 
 
 def _policy(page: str) -> dict[str, str]:
-    """The directives of a page's policy."""
+    """Returns the directives of a page's content security policy."""
     (found,) = re.findall(r'Content-Security-Policy" content="(.*?)"', page)
     rules = found.replace("&#39;", "'").split("; ")
     return dict(rule.split(" ", 1) for rule in rules)

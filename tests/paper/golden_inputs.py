@@ -1,6 +1,7 @@
-"""A batch of 6,000 steps and the weights that meet it, from NumPy's generator alone.
+"""Draws a batch of 6,000 steps and initial weights, from NumPy's generator alone.
 
-What made the golden numbers and what is held against them both read it, in float64.
+The program that made the golden numbers and the update that is compared with them both use these
+inputs, in float64.
 """
 
 import itertools
@@ -10,12 +11,12 @@ import numpy as np
 
 STEPS, OBSERVATION, ACTION, HIDDEN = 6000, 10, 2, 64
 STD = 0.6
-ARRIVALS = (350, 1210, 2399, 3050, 5200)  # steps that end an episode at its target
-TIME_OUTS = (1849, 4549)  # steps at which the step limit does; the last episode is cut at 6,000
+ARRIVALS = (350, 1210, 2399, 3050, 5200)  # steps in which a robot arrives and its episode ends
+TIME_OUTS = (1849, 4549)  # steps at which the step limit ends an episode; the last is cut at 6,000
 
 
 class Inputs(NamedTuple):
-    """What an update learns from, and `layers` by network: (kernel [in, out], bias [out])."""
+    """The inputs of an update; `layers` lists (kernel [in, out], bias [out]) for each network."""
 
     observation: np.ndarray
     noise: np.ndarray
@@ -24,7 +25,7 @@ class Inputs(NamedTuple):
 
 
 def draw() -> Inputs:
-    """Draws everything; PyTorch's default initialisation is U(+-1 / sqrt(inputs))."""
+    """Draws all inputs; weights follow PyTorch's default initialisation, U(+-1 / sqrt(inputs))."""
     random = np.random.default_rng(20241105)
     layers = {}
     for network, outputs in (("actor", ACTION), ("critic", 1)):
@@ -42,5 +43,5 @@ def draw() -> Inputs:
 
 
 def ends(steps: tuple[int, ...]) -> np.ndarray:
-    """Marks steps, [6000] bool."""
+    """Returns a mask of the given steps, [6000] bool."""
     return np.isin(np.arange(STEPS), steps)

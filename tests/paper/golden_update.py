@@ -1,6 +1,6 @@
-"""Our update on the golden batch, and how far it is from the golden numbers.
+"""Runs our update on the golden batch and measures its errors against the golden numbers.
 
-As a program it prints that as JSON; with JAX_ENABLE_X64=1 everything is float64.
+As a program, it prints the errors as JSON. With JAX_ENABLE_X64=1, all numbers are float64.
 """
 
 import functools
@@ -26,14 +26,14 @@ PAPER = load_train(["algo=paper"]).algo
 CONFIGS = {
     "terminal": PAPER,
     "leak": replace(PAPER, time_out="leak"),
-    # The schedule's second level, 0.55, begins with the update.
+    # The deviation falls to the schedule's second level, 0.55, between the batch and the update.
     "std": replace(PAPER, std_interval=inputs.STEPS),
 }
-TOTAL = 166  # updates of the run; constant learning rates do not ask
+TOTAL = 166  # updates of the run; constant learning rates do not depend on it
 
 
 def learner(config: AlgoConfig) -> LearnerState:
-    """The learner with the golden weights, [1]."""
+    """Returns a batch of one learner, [1], with the golden weights."""
     state = ppo.init(jax.random.key(0), config, inputs.OBSERVATION, inputs.ACTION, TOTAL)
     drawn = inputs.draw().layers
     params = {
@@ -58,18 +58,18 @@ def _layer(drawn: tuple[np.ndarray, np.ndarray]) -> dict[str, jax.Array]:
 
 
 def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajectory:
-    """The golden batch as a rollout of one arena, [T, 1, 1, 1].
+    """Returns the golden batch as a rollout of one arena, [T, 1, 1, 1].
 
     Args:
-      state: [1], that collected it.
-      config: of the learner.
-      idle: steps for which the robot waits after each arrival, with NaN in them: they must not
-        count. The batch is then longer by that.
+      state: state of the learner, [1], that collects the batch.
+      config: configuration of the learner.
+      idle: number of steps for which the robot waits after each arrival. These steps lengthen the
+        batch, hold NaN and must not affect the update.
     """
     drawn = inputs.draw()
     alone = jax.tree.map(lambda x: x[0], state)
     observation = jnp.asarray(drawn.observation, float)
-    # `act` takes the deviation that the learner has, here that of the whole batch.
+    # `act` uses the learner's current deviation, which here is the same for the whole batch.
     action, log_prob = ppo.act(alone, config, observation, jnp.asarray(drawn.noise, float))
     terminated, truncated = inputs.ends(inputs.ARRIVALS), inputs.ends(inputs.TIME_OUTS)
     value = ppo.values(alone, config, observation)
@@ -90,14 +90,14 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
 
 
 def _insert(column: jax.Array, idle: int) -> jax.Array:
-    """Inserts steps behind each arrival: False, or NaN."""
+    """Inserts `idle` steps of False or NaN after each arrival."""
     blank = False if column.dtype == bool else np.nan
     after = np.repeat(np.array(inputs.ARRIVALS) + 1, idle)
     return jnp.asarray(np.insert(np.asarray(column), after, blank, axis=0))
 
 
 def flat(params: networks.Params) -> np.ndarray:
-    """All kernels and biases in the order of golden.npz; of one learner, [1, ...]."""
+    """Returns all kernels and biases of one learner, [1, ...], in the order of golden.npz."""
     found = []
     for network, last in (("actor", "mean"), ("critic", "value")):
         torso = params[network]["torso"]
@@ -112,15 +112,15 @@ def _learn(
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     config = replace(PAPER, epochs=epochs)
     keys = jax.random.split(jax.random.key(0), 1)
-    backend = dispatch.resolve(config, inputs.OBSERVATION, inputs.ACTION)  # as a run has it
+    backend = dispatch.resolve(config, inputs.OBSERVATION, inputs.ACTION)  # as a run does
     update = jax.vmap(lambda s, b, k: ppo.update(s, config, b, k, TOTAL, backend))
     return update(state, batch, keys)
 
 
 def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:
-    """The loss of the metrics, a mean over the epochs."""
+    """Returns the total loss from the metrics, which are means over the epochs."""
     parts = metrics["policy_loss"] + config.value_cost * metrics["value_loss"]
-    parts += config.bound_cost * metrics["bound_loss"]  # 0: a tanh stays within
+    parts += config.bound_cost * metrics["bound_loss"]  # 0: tanh stays within the bounds
     return float((parts - config.entropy_cost * metrics["entropy"])[0])
 
 
@@ -129,7 +129,7 @@ def _apart(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict[str, float]:
-    """How far our update is from the golden one, by what is compared, after so many epochs."""
+    """Returns the error of each compared quantity, after each number of epochs in `trained`."""
     with np.load(Path(__file__).with_name("golden.npz")) as archive:
         golden = {k.partition("/")[2]: archive[k] for k in archive if k.startswith(f"{case}/")}
     config = CONFIGS[case]

@@ -1,14 +1,14 @@
-"""Makes golden.npz with PPO-PyTorch itself; none of its code is here.
+"""Makes golden.npz by running PPO-PyTorch itself, none of whose code is in this repository.
 
     python tests/paper/make_golden.py FOLDER
 
-with PyTorch (2.13.0 was used) and NumPy; FOLDER holds `PPO.py` of
+The program needs PyTorch (2.13.0 was used) and NumPy. FOLDER holds `PPO.py` of
 https://github.com/nikhilbarhate99/PPO-PyTorch at commit 728cce8.
 
-Three updates from the same weights: `terminal`, where the step limit ends a return; `leak`, where
-it does not; and `std`, where in addition to `terminal` the deviation fell from 0.6 to 0.55 between
-the batch and the update. All in float64, of which PPO.py knows only float32: its name is made to
-mean float64 as well.
+It makes three updates from the same weights. In `terminal`, the step limit ends a return; in
+`leak`, it does not. `std` is like `terminal`, but the deviation falls from 0.6 to 0.55 between the
+batch and the update. All numbers are float64. PPO.py asks for float32 by name, so `torch.float32`
+is redefined as float64.
 """
 
 import importlib.util
@@ -32,7 +32,7 @@ def main(folder: Path) -> None:
     theirs, found = _load(folder), {}
     for case in CASES:
         found |= {f"{case}/{name}": array for name, array in _update(theirs, case).items()}
-    # What is left out makes the file smaller; the losses of all epochs speak for it.
+    # These arrays are left out for a smaller file; the losses of all epochs test the same update.
     for name in ("leak/params_1", *(name for name in found if name.startswith("std/"))):
         if name != "std/losses":
             del found[name]
@@ -49,7 +49,7 @@ def _load(folder: Path) -> ModuleType:
 
 
 def _update(theirs: ModuleType, case: str) -> dict[str, np.ndarray]:
-    """Lets their update run, noting what passes through its loss and its optimiser."""
+    """Runs PPO-PyTorch's update, and records its returns, advantages, losses and weights."""
     ends_at_limit, std = CASES[case]
     drawn = inputs.draw()
     agent = theirs.PPO(10, 2, 3e-4, 1e-3, 0.99, EPOCHS, 0.2, True, inputs.STD)
@@ -82,13 +82,13 @@ def _update(theirs: ModuleType, case: str) -> dict[str, np.ndarray]:
         agent.update()
     finally:
         torch.Tensor.backward = backward
-    noted["advantages"] = (noted["returns"] - values)[::10]  # the rest follows from the returns
+    noted["advantages"] = (noted["returns"] - values)[::10]  # the returns determine the rest
     noted["params_80"] = _weights(agent.policy)
     return {name: np.asarray(array, np.float64) for name, array in noted.items()}
 
 
 def _fill(agent: Any, drawn: inputs.Inputs, ends_at_limit: bool) -> None:
-    """Puts the batch into their buffer, as their `select_action` and `train.py` do."""
+    """Fills PPO-PyTorch's buffer with the batch, as its `select_action` and `train.py` do."""
     done = inputs.ends(inputs.ARRIVALS) | (inputs.ends(inputs.TIME_OUTS) & ends_at_limit)
     buffer = agent.buffer
     for seen, noise, reward, end in zip(
@@ -120,7 +120,7 @@ def _set_weights(policy: Any, layers: dict[str, list[tuple[np.ndarray, np.ndarra
 
 
 def _weights(policy: Any) -> np.ndarray:
-    """All kernels [in, out] and biases, of actor and critic, layer by layer, in one row."""
+    """Returns kernels [in, out] and biases of actor and critic, layer by layer, as one vector."""
     flat = []
     for network in ("actor", "critic"):
         for layer in _linear(policy, network):

@@ -1,4 +1,4 @@
-"""One update of `algo=paper` against PPO-PyTorch; make_golden.py made the numbers."""
+"""Compares one update of `algo=paper` with numbers that make_golden.py got from PPO-PyTorch."""
 
 import json
 import os
@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from golden_update import errors
 
-# What the floating point of both sides may come to over 80 steps of Adam.
+# Bounds on the difference that float64 rounding in both programs may cause in 80 steps of Adam.
 DOUBLE = {"returns": 1e-10, "advantages": 1e-10, "loss_1": 1e-9, "loss_80": 1e-9}
-DOUBLE |= {"params_1": 1e-8, "params_80": 1e-6}  # relative in norm
+DOUBLE |= {"params_1": 1e-8, "params_80": 1e-6}  # relative error in norm
 
 
 @pytest.fixture(scope="module")
 def double() -> dict[str, dict[str, float]]:
-    """Of a process of its own, since a process has one precision."""
+    """Returns the float64 errors, from a separate process because a process has one precision."""
     program = Path(__file__).with_name("golden_update.py")
     found = subprocess.run(
         [sys.executable, str(program)],
@@ -35,7 +35,7 @@ def double() -> dict[str, dict[str, float]]:
         ("terminal", set(DOUBLE)),
         ("leak", set(DOUBLE) - {"params_1"}),
         ("std", {"loss_1", "loss_80"}),
-        # Steps for which a robot that has arrived waits count for nothing.
+        # Steps in which an arrived robot waits must not affect the update.
         ("waiting", {"returns", "advantages", "loss_1", "params_1"}),
     ],
 )
@@ -49,6 +49,6 @@ def test_an_update_is_theirs_in_double_precision(
 
 def test_an_update_is_theirs_in_single_precision() -> None:
     found = errors("terminal", trained=(80,))
-    # Relative in norm, after 80 epochs; float32 of both returns and gradients.
+    # `params_80` is a relative error in norm. Both bounds are for float32 returns and gradients.
     assert found["params_80"] <= 1e-3
     assert found["returns"] <= 1e-4

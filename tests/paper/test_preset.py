@@ -1,4 +1,4 @@
-"""`algo=paper` is the published experiment, whatever the defaults are; Table 1 row by row."""
+"""Checks `algo=paper` against Table 1 of the paper row by row, independently of the defaults."""
 
 import dataclasses
 from pathlib import Path
@@ -20,7 +20,7 @@ from swarmjax.training import program as programs
 
 FILES = Path(files.__file__).resolve().parents[2] / "configs"
 PAPER = load_train(["algo=paper"])
-# "timesteps" is Table 1's own word; a key of two words names what it stands for here.
+# Each row of Table 1, under its published name, with our setting and the published value.
 TABLE_1 = {
     "max training timesteps": (PAPER.budget, 1_000_000),
     "Max timesteps per episode": (PAPER.task.step_limit, 1500),
@@ -54,13 +54,13 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = files.read_preset("algo", "paper")
     of_gae = {"gae_lambda", "normalize_advantages"}
-    others = of_gae | {"memory_size", "update_backend", "network"}  # speed, extensions
+    others = of_gae | {"memory_size", "update_backend", "network"}  # for speed or extensions
     keys = {f.name for f in dataclasses.fields(AlgoConfig) if not f.metadata["derived"]}
     assert set(given["algo"]) - {"name"} | others == keys
     assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}
     assert set(given["task"]["reward"]) == rewards
-    # Equation 3.
+    # The weights of the paper's equation 3.
     weights = {name: weight for name, weight in vars(PAPER.task.reward).items() if weight}
     assert weights == {"progress": 1.0, "proximity": -0.001}
 
@@ -73,7 +73,7 @@ def test_the_preset_chooses_the_files_that_are_not_given() -> None:
     assert (other.realism.name, other.seeds) == ("ideal", 10)
     changed = load_train(["arenas=2", "algo.epochs=3", "algo=paper", "task.step_limit=100"])
     assert (changed.arenas, changed.algo.epochs, changed.task.step_limit) == (2, 3, 100)
-    assert load_train([]).realism.name == "ideal"  # the other preset chooses nothing
+    assert load_train([]).realism.name == "ideal"  # `algo=ppo`, the default, chooses no other file
 
 
 def test_the_stages_are_fixed_levels_that_hold_their_robots() -> None:
@@ -88,18 +88,19 @@ def test_the_stages_are_fixed_levels_that_hold_their_robots() -> None:
     for name in ("paper_expanded", "paper_expanded_boxes"):
         (stage,) = load_train(["algo=paper", f"stage={name}"]).stage
         assert (stage.robots, stage.side, stage.level) == (5, 1.5, "fixed")
-        task_stage.stack([stage])  # refuses what has no room
+        task_stage.stack([stage])  # refuses a stage without enough room
     task_stage.stack([*fence, *boxes])
 
 
 def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
     mine = drive.from_config(PAPER.robot)
-    # The realised (v, w) of epuck_facts.md section 1.7 for the action that commands (0.25, 3.14),
-    # (0.0625, 3.14) and (0, 3.14): both wheels at 6.28 rad/s; 6.25 / 2 and so on.
+    # The realised (v, w), in m/s and rad/s, are from epuck_facts.md section 1.7. The first three
+    # actions command (0.25, 3.14), (0.0625, 3.14) and (0, 3.14). With the first, both wheels reach
+    # their limit of 6.28 rad/s. In the second, 0.0625 m/s is 6.25 / 2 rad/s at each wheel.
     action = np.array([[1.0, 1.0], [-0.5, 1.0], [-1.0, 1.0], [1.0, 0.5]])
     wheels = drive.wheel_speeds(drive.command(action, mine, np), mine, np)
     found = drive.body_velocity(wheels, mine.wheel_radius, mine.track, np)
-    # To the digits of the table.
+    # The tolerance covers the digits that the table rounds off.
     np.testing.assert_allclose(
         found, [[0.1256, 0.0], [0.053, 2.78], [0.0, 3.14], [0.1256, 0.0]], atol=6e-3
     )
@@ -121,8 +122,8 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
         (["algo=paper", "algo.std_floor=0.7"],
          "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
         (["algo.mean_activation=tanh", "algo.activation=relu"],
-         "algo.mean_activation is tanh, but activation is relu, and a policy's file has one for "
-         "all layers: give activation=tanh or mean_activation=linear."),
+         "algo.mean_activation is tanh, but activation is relu, and a policy file stores one "
+         "activation for all layers: give activation=tanh or mean_activation=linear."),
         (["algo=paper", "budget=3e9"],
          "budget is 3000000000, but algo.exploration=scheduled counts control steps in 32 bits: "
          "give at most 2147483647."),

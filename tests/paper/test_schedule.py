@@ -1,6 +1,6 @@
-"""When the deviation falls, when an update falls, where episodes end: against a replay in NumPy.
+"""Compares deviations, updates and ends of episodes, step by step, with a replay in NumPy.
 
-The replay is the loop of PPO-PyTorch's train.py (commit 728cce8), in words of our own.
+The replay is our own implementation of the loop of PPO-PyTorch's train.py (commit 728cce8).
 """
 
 from dataclasses import replace
@@ -26,7 +26,7 @@ PAPER = load_train(["algo=paper", "sim.impl=jax"])
 
 
 class Replay(NamedTuple):
-    """Of each step the deviation it acts with; of each update the steps before it and its own."""
+    """The deviation of each step, the step count and deviation of each update, and episode ends."""
 
     std: np.ndarray
     updates: list[tuple[int, float]]
@@ -34,7 +34,7 @@ class Replay(NamedTuple):
 
 
 def _replay(config: TrainConfig, steps: int, arrived: np.ndarray) -> Replay:
-    """Replays `steps` steps of one environment, which is done where `arrived` says."""
+    """Replays `steps` steps of one environment, whose robot arrives where `arrived` is true."""
     algo = config.algo
     assert algo.std_interval is not None
     assert algo.std_decrement is not None
@@ -69,15 +69,15 @@ def test_the_updates_of_a_million_steps() -> None:
     assert PAPER.updates == len(replay.updates) == 166
     made = [(i + 1) * PAPER.arenas * PAPER.algo.rollout_length for i in range(PAPER.updates)]
     assert made == [step for step, _ in replay.updates]
-    # An update learns with the deviation of its rollout's last step; one that falls together with
-    # a step down, as at 750,000, comes first.
+    # An update learns with the deviation of its rollout's last step. If the deviation drops at the
+    # same step, as at 750,000, the update comes before the drop.
     last = exploration.scheduled_std(PAPER.algo, jnp.array(made) - 1)
     np.testing.assert_array_equal(last, np.float32([std for _, std in replay.updates]))
     assert (750_000, 0.5) in replay.updates
 
 
 def _drive(config: TrainConfig, updates: int) -> dict[str, np.ndarray]:
-    """Drives one arena for so many rollouts, learning nothing; [updates, T, ...] of each step."""
+    """Drives one arena for `updates` rollouts without learning; returns steps [updates, T, ...]."""
     program, schedule = programs.load(config)
     state = jax.jit(partial(loop.init, program))(schedule)
     rounds = jax.jit(lambda s: jax.lax.scan(partial(_round, program, schedule), s, length=updates))
@@ -88,7 +88,7 @@ def _drive(config: TrainConfig, updates: int) -> dict[str, np.ndarray]:
 def _round(
     program: Program, schedule: curriculum.Schedule, state: TrainState, _: None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """One rollout as in `loop.update`, and what is needed to see with which deviation."""
+    """Runs one rollout as `loop.update` does; returns the data that reveal its deviation."""
     config, world = program.config, program.world
     key, level_key, rollout_key = jax.random.split(state.key, 3)
     index = jnp.zeros((config.waiting, 1), jnp.int32)
@@ -112,16 +112,16 @@ def _round(
 
 
 def _check_run(config: TrainConfig, updates: int) -> None:
-    """Drives, and compares every step with the replay."""
+    """Drives one arena and compares every step with the replay."""
     steps = updates * config.algo.rollout_length
     found = _drive(config, updates)
     path = {name: found[name].reshape(-1) for name in ("square", "log_prob", "done", "arrived")}
     replay = _replay(config, steps, path["arrived"].astype(bool))
     assert np.flatnonzero(path["done"]).tolist() in (replay.ends, replay.ends[:-1])
-    # Both kinds of end, or nothing is tested; every episode counts for the curriculum.
+    # The test needs both kinds of episode end. Every episode counts for the curriculum.
     assert 0 < path["arrived"].sum() < path["done"].sum()
     assert set(found["cohort"].ravel()) <= {-1, 0}
-    # The density of a normal of two dimensions tells the deviation; float32.
+    # The density of a two-dimensional normal reveals the deviation. 2e-4 covers float32 rounding.
     std = replay.std
     log_prob = -path["square"] / (2 * std**2) - 2 * np.log(std) - np.log(2 * np.pi)
     np.testing.assert_allclose(path["log_prob"], log_prob, atol=2e-4)
@@ -130,7 +130,10 @@ def _check_run(config: TrainConfig, updates: int) -> None:
 
 
 def _config(scale: int) -> TrainConfig:
-    """The paper's numbers of steps divided by `scale`: one robot, with a target nearby."""
+    """Returns the paper's settings for one robot near its target, with fewer steps.
+
+    All numbers of steps are divided by `scale`.
+    """
     algo = replace(PAPER.algo, rollout_length=6000 // scale, std_interval=250_000 // scale)
     return replace(
         PAPER,

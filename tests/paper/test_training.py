@@ -1,4 +1,4 @@
-"""The preset's whole loop, with fewer steps of everything: two seeds side by side."""
+"""Tests the preset's whole training loop at a smaller scale, with two seeds side by side."""
 
 from dataclasses import replace
 from functools import partial
@@ -26,12 +26,12 @@ def config() -> TrainConfig:
     paper = load_train(["algo=paper", "sim.impl=jax"])
     return replace(
         paper,
-        stage=paper.stage[1:3],  # of two robots and of three, with the fence
+        stage=paper.stage[1:3],  # two robots, then three and the fence
         sim=replace(paper.sim, max_robots=3, max_obstacles=1),
         algo=replace(
             paper.algo, hidden_sizes=(8,), rollout_length=ROLLOUT, epochs=3, std_interval=250
         ),
-        # Nobody arrives in so short a time, so that promotion is by the deadline.
+        # No robot arrives within so few steps, so promotion happens at the deadline.
         task=replace(paper.task, step_limit=LIMIT),
         curriculum=replace(paper.curriculum, exploration="reset"),
         budget=ROLLOUT * UPDATES,
@@ -55,26 +55,27 @@ def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
         name: np.concatenate([first[name][:, :3], rest[name][:, :5]], axis=1) for name in first
     }
     assert len(traces) == 1
-    # Four episodes of 32 steps in a rollout of 128. The first one after the promotion had begun
-    # before it, on the stage that was left.
+    # A rollout of 128 steps holds four episodes of 32 steps. The first episode that ends after the
+    # promotion began before it, on the previous stage, so only three count in this update.
     assert found["episodes"].tolist() == [[4, 4, 4, 4, 3, 4, 4, 4]] * 2
-    # Every one counts, and is judged an update later with all that began in the same one; with
-    # those of the first update there is the one that the run began with.
+    # Every episode counts. Episodes that begin in the same update are judged together, one update
+    # later. The episode with which the run begins is judged with those of the first update.
     assert found["episodes_by_stage"][:, 1:4, 0].tolist() == [[5, 4, 4]] * 2
-    # Half of the eight updates for the first stage of two.
+    # The first of the two stages gets half of the eight updates.
     assert found["stage"].tolist() == [[0] * 4 + [1] * 4] * 2
-    # Each level for 250 steps: the updates end with the steps 127, 255, 383 and 511. The promotion
-    # then begins it anew, as told here. Logarithms in float32.
+    # Each level of the deviation lasts 250 steps, and the updates end with steps 127, 255, 383 and
+    # 511. The promotion then restarts the schedule, because of `exploration="reset"`. The tolerance
+    # is for logarithms in float32.
     std = [0.6, 0.55, 0.55, 0.5] * 2
     np.testing.assert_allclose(found["std"], [std] * 2, rtol=1e-6)
     for name in ("policy_loss", "value_loss", "grad_norm"):
         assert np.isfinite(found[name]).all()
     before, middle, after = (to_leaves(each)[KERNEL] for each in (start, early, state))
-    # Two of three robots are there at first: the learner of the third stands still.
+    # At first only two of three robots are present, so the learner of the third does not change.
     assert (np.abs(middle - before).max(axis=(2, 3)) > 1e-5).tolist() == [[True, True, False]] * 2
     assert (np.abs(after - middle).max(axis=(2, 3)) > 1e-5).all()
-    assert not np.array_equal(after[0], after[1])  # seeds
-    # No normaliser: it has counted nothing.
+    assert not np.array_equal(after[0], after[1])  # the seeds differ
+    # The preset uses no normaliser, so its count stays zero.
     assert not to_leaves(state)["learners/normalizer/count"].any()
     assert to_leaves(state)["learners/explored"].tolist() == [[512] * 3] * 2
 
@@ -82,7 +83,7 @@ def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
 def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path: Path) -> None:
     program, schedule = programs.load(config)
     state = jax.jit(partial(seeds.init, program))(schedule)
-    # As drawn the last layer is small; ten times as large, tanh bends it.
+    # The last layer is drawn small; ten times larger, it reaches the nonlinear range of tanh.
     actor = state.learners.params["actor"]
     actor = {**actor, "mean": jax.tree.map(lambda x: 10.0 * x, actor["mean"])}
     learners = state.learners.replace(params={**state.learners.params, "actor": actor})
@@ -94,6 +95,6 @@ def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path
     second = jax.tree.map(lambda x: x[1], learners)
     mode = jax.vmap(partial(ppo.mode, config=config.algo))
     expected = mode(second, observation=observation.swapaxes(0, 1)).swapaxes(0, 1)
-    # float32, in two libraries.
+    # Two libraries compute this in float32.
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert np.abs(expected).max() > 0.5

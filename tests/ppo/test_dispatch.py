@@ -1,4 +1,4 @@
-"""Which way of computing an update is taken, and that all can be had without the faster ones."""
+"""Checks which backend computes an update, and that autodiff replaces missing faster backends."""
 
 import sys
 from types import SimpleNamespace
@@ -71,21 +71,22 @@ def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) ->
             AlgoConfig(update_backend="fused", hidden_sizes=(48, 64)), OBSERVATION, ACTION
         )
     assert str(unfit.value) == (
-        "algo.update_backend is fused, but algo.hidden_sizes is [48,64], which does not fit the "
-        "chip: give two layers of 16, 32 or 64, or algo.update_backend=auto."
+        "algo.update_backend is fused, but algo.hidden_sizes is [48,64], which the kernels do not "
+        "support: give two layers of 16, 32 or 64, or algo.update_backend=auto."
     )
 
 
 def test_a_history_that_does_not_fit_the_chip_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     _on(monkeypatch, compute_capability="9.0")
     config = AlgoConfig(update_backend="fused")
-    # 12 observations of 10 numbers are padded to 128, the widest that the kernels take.
+    # The kernels take at most 128 numbers: 12 observations of 10 numbers each, after padding.
     assert dispatch.resolve(AlgoConfig(), 13 * OBSERVATION, ACTION) != "fused"
     with pytest.raises(ConfigError) as unfit:
         dispatch.resolve(config, 13 * OBSERVATION, ACTION)
     assert str(unfit.value) == (
-        "algo.update_backend is fused, but 130 numbers are observed, which do not fit the chip: "
-        "give a smaller task.history, fewer task.observations, or algo.update_backend=auto."
+        "algo.update_backend is fused, but 130 numbers are observed, more than the kernels "
+        "support: give a smaller task.history, fewer task.observations, or "
+        "algo.update_backend=auto."
     )
 
 

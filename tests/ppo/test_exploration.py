@@ -1,4 +1,4 @@
-"""The schedule of exploration, and the learner that follows it."""
+"""Checks the schedule of exploration, and the learner that follows it."""
 
 from dataclasses import replace
 
@@ -21,12 +21,12 @@ SCHEDULED = AlgoConfig(
 
 def test_levels_by_hand() -> None:
     expected = (0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1)
-    assert exploration.levels(SCHEDULED) == expected  # rounded to four digits, so exactly
-    # 0.5 - 0.3 = 0.2, and then 0.15 instead of -0.1.
+    assert exploration.levels(SCHEDULED) == expected  # exact, since rounded to four digits
+    # The second level is 0.5 - 0.3 = 0.2, and the third is the floor, 0.15, instead of -0.1.
     steep = replace(SCHEDULED, initial_std=0.5, std_decrement=0.3, std_floor=0.15)
     assert exploration.levels(steep) == (0.5, 0.2, 0.15)
     assert exploration.levels(replace(SCHEDULED, initial_std=0.1)) == (0.1,)
-    # What rounds to nothing never moves.
+    # A decrement that rounds to 0 never lowers the deviation.
     assert exploration.levels(replace(SCHEDULED, std_decrement=1e-5)) == (0.6,)
 
 
@@ -46,7 +46,7 @@ def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
     for steps, explored, std in ((100, 100, 0.6), (1, 101, 0.55), (99, 200, 0.55), (60, 260, 0.5)):
         state = learner.explore(state, SCHEDULED, steps)
         assert state.explored == explored
-        # Logarithm and exponential in float32.
+        # float32 rounding of a logarithm and an exponential.
         np.testing.assert_allclose(_std(state), [std, std], rtol=1e-6)
     begun = learner.explore_anew(state, SCHEDULED)
     assert begun.explored == 0

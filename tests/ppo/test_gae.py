@@ -1,4 +1,4 @@
-"""Advantages worked by hand, by a NumPy loop, and at the two limits of lambda."""
+"""Checks advantages against values by hand, against a NumPy loop, and at lambda 0 and 1."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,7 @@ def _rollout(seed: int = 0, end_share: float = 0.2) -> Rollout:
 
 
 def _loop(rollout: Rollout, discount: float, gae_lambda: float) -> np.ndarray:
-    """Equation 16, each sum written out step by step, in float64."""
+    """Returns the advantages of equation 16 of the GAE paper, summed step by step in float64."""
     advantages = np.zeros((T, B))
     for robot in range(B):
         for start in range(T):
@@ -45,15 +45,17 @@ def _loop(rollout: Rollout, discount: float, gae_lambda: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("terminated", "truncated", "expected"),
     [
-        # Errors r + 0.5 V' - V, carry 0.5 * 0.5 = 0.25.
-        # No end: errors 1 + 2 - 2 = 1, 0 + 3 - 4 = -1, 4 + 4 - 6 = 2;
+        # The errors are r + 0.5 V' - V; a step adds 0.5 * 0.5 = 0.25 of the next advantage.
+        # Without an end, the errors are 1 + 2 - 2 = 1, 0 + 3 - 4 = -1 and 4 + 4 - 6 = 2;
         # A2 = 2, A1 = -1 + 0.25 * 2 = -0.5, A0 = 1 - 0.25 * 0.5 = 0.875.
         ([0, 0, 0], [0, 0, 0], [0.875, -0.5, 2.0]),
-        # Terminated at 1: error 0 - 4 = -4, nothing carried into it; A0 = 1 - 0.25 * 4 = 0.
+        # Terminated at step 1: its error is 0 - 4 = -4, and it adds nothing of A2;
+        # A0 = 1 - 0.25 * 4 = 0.
         ([0, 1, 0], [0, 0, 0], [0.0, -4.0, 2.0]),
-        # Truncated at 1: error -1 with its bootstrap, nothing carried; A0 = 1 - 0.25 = 0.75.
+        # Truncated at step 1: its error is -1 with its bootstrap, and it adds nothing of A2;
+        # A0 = 1 - 0.25 = 0.75.
         ([0, 0, 0], [0, 1, 0], [0.75, -1.0, 2.0]),
-        # Both at 1: terminated wins.
+        # Terminated and truncated at step 1: the step counts as terminated.
         ([0, 1, 0], [0, 1, 0], [0.0, -4.0, 2.0]),
     ],
 )
@@ -79,7 +81,7 @@ def test_scan_equals_a_numpy_loop(seed: int) -> None:
     rollout = _rollout(seed)
     advantages, returns = generalized_advantages(**rollout, discount=0.97, gae_lambda=0.9)
     expected = _loop(rollout, 0.97, 0.9)
-    # float32 against float64, twelve terms of order 1.
+    # Sums of twelve terms of order 1, in float32 against float64.
     np.testing.assert_allclose(advantages, expected, atol=5e-6)
     np.testing.assert_allclose(returns, expected + rollout["values"], atol=5e-6)
 
@@ -88,7 +90,7 @@ def test_lambda_zero_is_the_one_step_error() -> None:
     rollout = _rollout()
     _, returns = generalized_advantages(**rollout, discount=0.9, gae_lambda=0.0)
     expected = rollout["rewards"] + 0.9 * ~rollout["terminated"] * rollout["next_values"]
-    # One subtraction and one addition of the same float32 value.
+    # float32 rounding: the same value is subtracted and added once.
     np.testing.assert_allclose(returns, expected, atol=1e-6)
 
 
@@ -103,7 +105,7 @@ def test_lambda_one_is_the_discounted_return_whatever_the_values() -> None:
     for t in reversed(range(T)):
         following = rollout["rewards"][t] + 0.9 * following
         expected[t] = following
-    # float32 against float64, twelve terms of order 1.
+    # Sums of twelve terms of order 1, in float32 against float64.
     np.testing.assert_allclose(returns, expected, atol=5e-6)
 
 
@@ -132,7 +134,7 @@ def test_a_truncated_step_reads_its_next_value() -> None:
     before, _ = generalized_advantages(**rollout, discount=0.5, gae_lambda=0.95)
     rollout["next_values"][5] += 2.0
     after, _ = generalized_advantages(**rollout, discount=0.5, gae_lambda=0.95)
-    # discount * 2 = 1, to the rounding of values of order 1.
+    # The advantage grows by discount * 2 = 1, up to the rounding of values of order 1.
     np.testing.assert_allclose(after[5] - before[5], np.ones(B), atol=1e-6)
 
 
@@ -144,7 +146,7 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
 
 
 def test_agrees_with_brax_where_brax_is_right() -> None:
-    """Brax's own `advantages` are not GAE unless lambda is 1; its `vs - values` is."""
+    """Compares with Brax's `vs - values`: Brax's own `advantages` are GAE only if lambda is 1."""
     from brax.training.agents.ppo import losses as brax_losses
 
     random = np.random.default_rng(3)
@@ -165,6 +167,6 @@ def test_agrees_with_brax_where_brax_is_right() -> None:
     advantages, returns = generalized_advantages(
         rewards, values, next_values, terminated, never, discount=0.95, gae_lambda=0.9
     )
-    # 2e-6: float32, sums of at most twelve terms in another order.
+    # 2e-6: float32 sums of at most twelve terms, added in another order.
     np.testing.assert_allclose(advantages, targets - values, atol=2e-6)
     np.testing.assert_allclose(returns, targets, atol=2e-6)

@@ -1,4 +1,7 @@
-"""Networks that hear: order does not matter, absent ones do not count, and a message is learned."""
+"""Checks networks that hear neighbours.
+
+The order of neighbours does not matter, absent neighbours do not count, and a message is learned.
+"""
 
 import dataclasses
 import functools
@@ -25,7 +28,7 @@ KINDS = {
 
 
 def _learner(config: AlgoConfig, actions: int = 3, state: int = 0) -> LearnerState:
-    """A learner whose heads are not small."""
+    """Returns a learner whose weights have noise added, since new output layers are near 0."""
     made = learner.init(jax.random.key(0), config, SIZE, actions, 10, state)
     leaves, tree = jax.tree.flatten(made.params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
@@ -34,7 +37,10 @@ def _learner(config: AlgoConfig, actions: int = 3, state: int = 0) -> LearnerSta
 
 
 def _seen(there: tuple[int, ...] = (1, 1, 1, 0)) -> tuple[np.ndarray, np.ndarray]:
-    """What is seen besides, [OWN], and rows of neighbours [COUNT, WIDTH], zeros where none is."""
+    """Returns a robot's own observation [OWN] and its neighbours' rows [COUNT, WIDTH].
+
+    Rows of absent neighbours are 0.
+    """
     draw = np.random.default_rng(2)
     rows = draw.uniform(-1, 1, (COUNT, WIDTH)).astype(np.float32)
     rows[:, 0] = 1.0
@@ -42,7 +48,7 @@ def _seen(there: tuple[int, ...] = (1, 1, 1, 0)) -> tuple[np.ndarray, np.ndarray
 
 
 def _think(kind: str, own: np.ndarray, rows: np.ndarray) -> tuple[Any, Any]:
-    """Action and value of one observation."""
+    """Returns the action and the value of one observation."""
     config = networks.bind_hearing(AlgoConfig(hidden_sizes=(8, 6), **KINDS[kind]), SIZE, 4, WIDTH)
     state = jnp.array([0.5, -0.5]) if config.critic == "state" else None
     mine = _learner(config, state=0 if state is None else STATE)
@@ -61,7 +67,7 @@ def test_the_order_of_neighbours_does_not_matter(kind: str, order: list[int]) ->
     for found, expected in zip(
         _think(kind, own, rows[order]), _think(kind, own, rows), strict=True
     ):
-        np.testing.assert_allclose(found, expected, atol=2e-6)  # sums of float32 in another order
+        np.testing.assert_allclose(found, expected, atol=2e-6)  # float32 sums in another order
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -76,7 +82,7 @@ def test_what_is_heard_is_the_sum_of_one_layer_of_each() -> None:
     mine = jax.tree.map(np.asarray, _learner(config).params["actor"])
     own, rows = _seen()
     each = np.tanh(rows @ mine["hearing"]["kernel"] + mine["hearing"]["bias"])
-    x = np.concatenate([own, each[:3].sum(axis=0)])  # the fourth is not there
+    x = np.concatenate([own, each[:3].sum(axis=0)])  # the fourth neighbour is absent
     for name in ("hidden_0", "hidden_1"):
         x = np.tanh(x @ mine["torso"][name]["kernel"] + mine["torso"][name]["bias"])
     expected = x @ mine["mean"]["kernel"] + mine["mean"]["bias"]
@@ -115,8 +121,9 @@ def test_the_kernels_are_not_taken_for_robots_that_hear(monkeypatch: pytest.Monk
     assert dispatch.resolve(heard, 10 + COUNT * WIDTH, 2) == "autodiff"
 
 
-# A probe: two robots, each of which sees a draw that the other one is paid for acting on. What it
-# takes is the sender's message of the control step before, which nobody tells it to send.
+# A probe with pairs of robots. Each robot sees a number, -1 or 1, and its partner is rewarded for
+# acting on that number. The partner needs the message that the robot sent one control step before.
+# Only the reward that both share teaches the robot to send it.
 PAIRS, UPDATES, STEPS = 64, 150, 4
 PROBE = AlgoConfig(
     hidden_sizes=(16, 16),
@@ -127,11 +134,11 @@ PROBE = AlgoConfig(
     actor_learning_rate=5e-3,
     critic_learning_rate=5e-3,
 )
-ROW = 5  # there, distance, cosine, sine, message
+ROW = 5  # presence, distance, cosine, sine, message
 
 
 def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
-    """What both robots [B, 2] see: the own draw, and the other one with its message."""
+    """Returns what both robots [B, 2] see: their own number, and a row with the other's message."""
     one = jnp.ones_like(draw)
     row = [one, 0.5 * one, one, 0.0 * one, said[:, ::-1]]
     return jnp.stack([draw, *row], axis=-1)
@@ -140,13 +147,13 @@ def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
 def _live(
     config: AlgoConfig, deaf: bool, state: LearnerState, carry: Any, key: jax.Array
 ) -> tuple[Any, Any]:
-    """A control step of all pairs; episodes of STEPS, in which the draws stay."""
+    """Runs one control step of all pairs; the numbers stay fixed in an episode of STEPS steps."""
     draw, said, clock = carry
     noise, fresh = jax.random.split(key)
     seen = _look(draw, said)
     action, log_prob = learner.act(state, config, seen, jax.random.normal(noise, (PAIRS, 2, 2)))
     heard = jnp.where(deaf, 0.0, jnp.clip(action[..., 1], -1.0, 1.0))
-    # The first step of an episode is not counted: nothing has been said.
+    # The first step of an episode gives no reward, since no message has been sent yet.
     paid = -jnp.abs(action[..., 0] - draw[:, ::-1]) * (clock > 0)
     ends = clock + 1 == STEPS
     drawn = jax.random.rademacher(fresh, draw.shape, jnp.float32)
@@ -156,12 +163,12 @@ def _live(
         jnp.where(ends, 0, clock + 1),
     )
     value = learner.values(state, config, seen)
-    # The episode in which the others are paid by what one says ends with `ends`.
+    # A message earns a reward only within its episode, which ends with `ends` for both robots.
     return after, (seen, action, log_prob, paid, value, jnp.broadcast_to(ends, paid.shape))
 
 
 def _shared(paid: jax.Array) -> jax.Array:
-    """What both earn, [T, B, 2]: a sender has no other pay for its message."""
+    """Returns the summed reward of both robots, [T, B, 2], which also rewards a good message."""
     return paid + paid[..., ::-1]
 
 
@@ -196,7 +203,7 @@ def _iterate(config: AlgoConfig, deaf: bool, carry: Any, key: jax.Array) -> tupl
 
 
 def _earned(deaf: bool) -> float:
-    """What robots earn in a step at the end: at best 0, by chance -1."""
+    """Returns the mean reward per step at the end of training: 0 at best, -1 by chance."""
     config = networks.bind_hearing(PROBE, 1 + ROW, 1, ROW)
     state = learner.init(jax.random.key(0), config, 1 + ROW, 2, UPDATES)
     keys = jax.random.split(jax.random.key(1), UPDATES)
@@ -212,7 +219,7 @@ def _earned(deaf: bool) -> float:
 
 @pytest.mark.slow
 def test_a_task_that_only_a_message_solves_is_learned_with_messages_alone() -> None:
-    # Who hears nothing earns most by any constant within -1..1: a mean of -1, and less by its
-    # exploration. Who hears is off by no more than exploration.
+    # A robot that hears nothing does best with any constant action within -1..1: its mean reward
+    # is -1, less the cost of exploration. A robot that hears loses only the cost of exploration.
     assert _earned(deaf=True) < -0.95
     assert _earned(deaf=False) > -0.5

@@ -1,4 +1,4 @@
-"""What one update must and must not do."""
+"""Checks what one update must and must not do."""
 
 import functools
 from dataclasses import replace
@@ -22,7 +22,7 @@ ONE_STEP = AlgoConfig(hidden_sizes=(8,), epochs=1, num_minibatches=1)
 def _update(
     state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
 ) -> tuple[LearnerState, losses.Metrics]:
-    backend = dispatch.resolve(config, OBSERVATION, U)  # as a run has it
+    backend = dispatch.resolve(config, OBSERVATION, U)  # as in a run
     return learner.update(state, config, batch, key, UPDATES, backend)
 
 
@@ -47,7 +47,10 @@ def _fresh(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
 
 
 def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
-    """A learner with momentum, moments, and means that depend strongly on the observation."""
+    """Returns a learner after one update, so with Adam's momentum and observation moments.
+
+    Its mean actions depend strongly on the observation.
+    """
     state = _fresh(seed, config)
     state, _ = _update(state, _batch(state, 10, config), jax.random.key(20), config=config)
     params = jax.tree.map(jnp.copy, state.params)
@@ -56,7 +59,7 @@ def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
 
 
 def _spoilt(batch: Batch, valid: jax.Array) -> Batch:
-    """The batch with NaN wherever it is not valid."""
+    """Returns the batch with NaN in all invalid samples."""
 
     def spoil(x: jax.Array) -> jax.Array:
         return jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, jnp.nan)
@@ -69,7 +72,7 @@ def _assert_equal(got: object, expected: object) -> None:
 
 
 def _step_sizes(before: networks.Params, after: networks.Params) -> dict[str, float]:
-    """The largest move of any parameter, by network."""
+    """Returns the largest change of any parameter, by network."""
     return {
         name: max(
             float(jnp.abs(a - b).max())
@@ -116,10 +119,11 @@ def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> No
     )
     shifted = replace(shifted, action=action, log_prob=log_prob)
     updated, metrics = _update(state, shifted, jax.random.key(2), config=ONE_STEP)
-    # exp and log densities round at about 1e-6; with the updated normalizer it is of order 0.1.
+    # exp and log densities round at about 1e-6. With the updated normalizer, the approximate KL
+    # divergence would be of order 0.1.
     np.testing.assert_allclose(metrics["approx_kl"], 0.0, atol=1e-5)
     assert metrics["clip_fraction"] == 0.0
-    # At ratio 1 the surrogate is the mean of advantages that have mean 0, to rounding.
+    # At ratio 1 the surrogate is the mean of the normalised advantages: 0, up to rounding.
     np.testing.assert_allclose(metrics["policy_loss"], 0.0, atol=1e-5)
     stale = learner.act(updated, ONE_STEP, shifted.observation, jnp.zeros((G, N, U)))[0]
     fresh = learner.act(
@@ -148,7 +152,7 @@ def test_advantages_are_normalised_over_the_valid_samples_of_the_batch() -> None
     key = jax.random.key(2)
     _, expected = _update(state, batch, key)
     _, scaled = _update(state, replace(batch, advantage=7.0 * batch.advantage - 30.0), key)
-    # Rounding of 7 a - 30 with values around 5: 1e-6 of the advantages' spread.
+    # 7 a - 30, with a around 5, rounds by 1e-6 of the spread of the advantages.
     np.testing.assert_allclose(scaled["policy_loss"], expected["policy_loss"], atol=1e-5)
     np.testing.assert_allclose(scaled["grad_norm"], expected["grad_norm"], rtol=1e-4)
 
@@ -198,7 +202,8 @@ def test_a_batch_without_a_valid_sample_changes_nothing_at_all() -> None:
 def test_minibatches_without_a_valid_sample_are_no_steps() -> None:
     state = _fresh()
     batch = _batch(state)
-    # All valid samples are in two of eight groups: of four minibatches an epoch, at most two step.
+    # All valid samples are in two of eight groups, so at most two of an epoch's four minibatches
+    # take a step.
     valid = jnp.zeros((G, N), bool).at[0].set(True).at[5].set(True)
     updated, _ = _update(state, _spoilt(batch, valid), jax.random.key(1))
     steps = optax.tree.get_all_with_path(updated.optimizer_state, "count")
@@ -215,8 +220,8 @@ def test_each_epoch_learns_from_every_group_once() -> None:
     state = _fresh()
     batch = _batch(state)
     config = AlgoConfig(hidden_sizes=(8,), epochs=2, num_minibatches=4, critic_learning_rate=1e-12)
-    # With a critic that stands still, the value loss averages over every sample exactly when each
-    # epoch visits each group once. Returns 2**g tell every choice of groups apart.
+    # The critic does not change, so the value loss is the mean over all samples exactly if each
+    # epoch visits each group once. With returns of 2**g, every choice of groups has its own sum.
     returns = jnp.broadcast_to(2.0 ** jnp.arange(G)[:, None], (G, N))
     batch = replace(batch, return_=returns, valid=jnp.ones((G, N), bool))
     _, metrics = _update(state, batch, jax.random.key(1), config=config)
@@ -231,8 +236,8 @@ def test_actor_and_critic_move_at_their_own_learning_rates() -> None:
     state = _fresh(config=ONE_STEP)
     updated, _ = _update(state, _batch(state, 0, ONE_STEP), jax.random.key(1), config=ONE_STEP)
     moves = _step_sizes(state.params, updated.params)
-    # Adam's first step is rate * g / (|g| + 1e-5): the rate, less 1e-5 / |g| of it, where the
-    # largest |g| of each network is at least 1e-3 here.
+    # Adam's first step is rate * g / (|g| + 1e-5): the rate, less a share of about 1e-5 / |g|. The
+    # largest |g| of each network is at least 1e-3 here, so the share is at most 1e-2.
     rates = optimizer.learning_rates(ONE_STEP, UPDATES)
     np.testing.assert_allclose(moves["actor"], rates["actor"], rtol=1e-2)
     np.testing.assert_allclose(moves["critic"], rates["critic"], rtol=1e-2)
@@ -246,7 +251,7 @@ def test_one_norm_clips_the_gradient_of_both_networks() -> None:
     limit = ONE_STEP.max_grad_norm
     assert limit is not None
     assert metrics["grad_norm"] > limit
-    # After its first step Adam's mean is 0.1 times the gradient that it was given.
+    # After the first step, Adam's mean is 0.1 times the gradient that Adam was given.
     momentum = [mu for _, mu in optax.tree.get_all_with_path(updated.optimizer_state, "mu")]
     # Float32 rounding of a sum of squares.
     np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * limit, rtol=1e-5)
@@ -265,7 +270,8 @@ def test_linear_schedule_falls_to_zero_over_the_run_and_constant_does_not() -> N
         linear = _step_sizes(state.params, linear_state.params)
         full = _step_sizes(state.params, constant_state.params)
         for network in ("actor", "critic"):
-            # Moves of 1e-4 on parameters of order 1 are known to 2**-24 / 1e-4 = 6e-4.
+            # A change of 1e-4 in a parameter of order 1 has a relative error of
+            # 2**-24 / 1e-4 = 6e-4.
             np.testing.assert_allclose(
                 linear[network], (1.0 - done / UPDATES) * full[network], rtol=3e-3, atol=1e-9
             )
@@ -304,7 +310,7 @@ def test_any_split_of_a_compiled_loop_gives_the_same_bits() -> None:
 def test_learners_under_vmap_equal_single_ones() -> None:
     states = [_experienced(seed) for seed in range(3)]
     batches = [_batch(state, seed) for seed, state in enumerate(states)]
-    # One learner whose robot is absent, as in the first stage of a curriculum.
+    # The robot of one learner is absent, as in the first stage of a curriculum.
     batches[1] = _spoilt(batches[1], jnp.zeros((G, N), bool))
     keys = jax.random.split(jax.random.key(5), 3)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
@@ -312,8 +318,8 @@ def test_learners_under_vmap_equal_single_ones() -> None:
     together, metrics = jax.vmap(_update)(stacked, stacked_batch, keys)
     for i in range(3):
         alone, alone_metrics = _update(states[i], batches[i], keys[i])
-        # A batched matrix product adds in another order; twelve Adam steps of at most 1e-3 turn
-        # its relative error of 1e-6 into 1e-5 of a step, and parameters are of order 1.
+        # A batched matrix product adds in another order, with a relative error of 1e-6. Twelve
+        # Adam steps of at most 1e-3 turn the error into 1e-5 of a step; parameters are of order 1.
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-4, atol=2e-5),
             (together, metrics),
@@ -351,7 +357,7 @@ def test_without_a_norm_the_gradient_is_not_clipped() -> None:
     updated, metrics = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
     momentum = [mu for _, mu in optax.tree.get_all_with_path(updated.optimizer_state, "mu")]
     assert metrics["grad_norm"] > 0.5
-    # After its first step Adam's mean is 0.1 times the gradient; float32 rounding.
+    # After the first step, Adam's mean is 0.1 times the gradient, up to float32 rounding.
     np.testing.assert_allclose(optax.tree.norm(momentum), 0.1 * metrics["grad_norm"], rtol=1e-5)
 
 
@@ -359,7 +365,8 @@ def test_adam_takes_its_epsilon_from_the_config() -> None:
     config = replace(ONE_STEP, adam_epsilon=10.0, max_grad_norm=None)
     state = _fresh(config=config)
     updated, metrics = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
-    # rate * g / (|g| + 10), at most a tenth of rate * the norm of g: far below the rate itself.
+    # A step of rate * g / (|g| + 10) is at most a tenth of the rate times the norm of g, which is
+    # far below the rate itself.
     move = _step_sizes(state.params, updated.params)["critic"]
     rate = optimizer.learning_rates(config, UPDATES)["critic"]
     assert 0.0 < move < 0.1 * rate * float(metrics["grad_norm"])
@@ -382,7 +389,7 @@ def test_advantages_may_be_left_as_they_are() -> None:
     tenfold = replace(batch, advantage=10.0 * batch.advantage)
     _, metrics = _update(state, batch, jax.random.key(1), config=config)
     _, more = _update(state, tenfold, jax.random.key(1), config=config)
-    # The surrogate is linear in the advantage; float32 rounding.
+    # The surrogate is linear in the advantage, up to float32 rounding.
     np.testing.assert_allclose(more["policy_loss"], 10.0 * metrics["policy_loss"], rtol=1e-5)
 
 
@@ -391,7 +398,7 @@ def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:
     state = _fresh(config=config)
     batch = _batch(state, 0, config)
     _, metrics = _update(state, batch, jax.random.key(1), config=config)
-    # At ratio 1 the policy's loss is the mean advantage, about 5, negated. Float32.
+    # At ratio 1 the policy loss is minus the mean advantage of about 5, up to float32 rounding.
     mean = np.mean(np.asarray(batch.advantage)[np.asarray(batch.valid)])
     np.testing.assert_allclose(metrics["policy_loss"], -mean, rtol=1e-5)
 

@@ -1,4 +1,4 @@
-"""The loss against NumPy, with masks."""
+"""Checks the loss against NumPy, with masks."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def _minibatch(valid_share: float = 0.6) -> Minibatch:
     return Minibatch(
         observation=observation,
         action=action,
-        # Ratios from e**-0.9 to e**0.9, so many are outside 0.8..1.2 on either side.
+        # Ratios range from e**-0.9 to e**0.9, so many lie below 0.8 and many above 1.2.
         log_prob=log_prob + random.normal(size=B).clip(-3, 3).astype(np.float32) * 0.3,
         advantage=random.normal(size=B).astype(np.float32),
         return_=random.normal(size=B).astype(np.float32),
@@ -59,7 +59,7 @@ def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
     return parts
 
 
-# With 0.25 expected, the sums are divided by 1.
+# With 0.25 expected valid samples, the sums are divided by 1.
 @pytest.mark.parametrize("expected_valid", [0.25, 5.0, 14.0])
 def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
     minibatch = _minibatch()
@@ -90,7 +90,8 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
         gradient = jax.grad(lambda p: ppo_loss(p, samples, config, jnp.float32(B))[0])(PARAMS)
         return float(jnp.abs(gradient["actor"]["mean"]["kernel"]).max())
 
-    # The minimum of equation 7 is flat only where moving on would gain more.
+    # The minimum in equation 7 of the PPO paper is flat only where the ratio has left the clip
+    # range and a further move would raise the surrogate.
     assert slope(1.3, 1.0) == 0.0
     assert slope(0.7, -1.0) == 0.0
     assert slope(1.3, -1.0) > 0.0
@@ -99,7 +100,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
 
 def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
     minibatch = _minibatch(valid_share=0.0)
-    # A log ratio of about 1000: masked only after exp, its gradient would be NaN.
+    # The log ratio is about 1000: if it were masked only after exp, its gradient would be NaN.
     minibatch = replace(minibatch, log_prob=minibatch.log_prob - 1000.0)
     (loss, metrics), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(
         PARAMS, minibatch, CONFIG, jnp.float32(0.0)
@@ -127,7 +128,7 @@ def test_mean_over_unevenly_filled_minibatches_is_the_loss_of_the_batch() -> Non
     batch = replace(batch, valid=valid)
     loss = jax.value_and_grad(ppo_loss, has_aux=True)
     whole = loss(PARAMS, batch, CONFIG, jnp.float32(9.0))
-    # Three minibatches of eight with 8, 1 and 0 valid samples: each expects 9 / 3 of them.
+    # Three minibatches of eight samples have 8, 1 and 0 valid samples; each expects 9 / 3 = 3.
     parts = [
         loss(
             PARAMS,

@@ -1,4 +1,4 @@
-"""The gated recurrent unit: its equations, its gradient through time, and where it forgets."""
+"""Checks the gated recurrent unit: its equations, its gradient through time, and its resets."""
 
 from dataclasses import replace
 from typing import Any
@@ -44,7 +44,7 @@ def test_the_unit_is_that_of_flax() -> None:
     made, params = _gru()
     features, memory = _drawn(ROWS, WIDTH), _drawn(ROWS, SIZE, seed=1)
     mine = params["params"]
-    # Flax adds no bias to what is recalled but the candidate's.
+    # Flax has a recurrent bias for the candidate only, so the biases of the gates are set to 0.
     recalled = np.array(mine["recurrent"]["bias"])
     mine["recurrent"]["bias"] = np.where(np.arange(3 * SIZE) < 2 * SIZE, 0.0, recalled)
     theirs: dict[str, Any] = {}
@@ -125,7 +125,8 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
         gradient, step = jax.grad(loss)(flat), 1e-6
         for way in towards:
             slope = (loss(flat + step * way) - loss(flat - step * way)) / (2 * step)
-            # Of float64 differences over 2e-6 about 1e-9 is left, and of curvature 1e-10.
+            # A float64 difference over 2e-6 has a rounding error of about 1e-9, and the curvature
+            # adds an error of 1e-10.
             np.testing.assert_allclose(gradient @ way, slope, rtol=1e-6)
 
 
@@ -135,9 +136,10 @@ _EPISODE, _WORLDS, _UPDATES = 21, 64, 150
 
 
 def _play(config: AlgoConfig, state: Any, key: jax.Array, history: int) -> tuple[Batch, jax.Array]:
-    """An episode each: a cue of -1 or 1 at its first step, and its sign asked for at the last.
+    """Plays one episode in each world and returns the batch and the mean reward.
 
-    Of a `history` above 1 the networks see that many observations, as an environment stacks them.
+    The first step shows a cue of -1 or 1, and the last step rewards an action of the cue's sign.
+    With a `history` above 1, the networks see that many observations, stacked as in an environment.
     """
     cue_key, noise_key = jax.random.split(key)
     cue = jax.random.rademacher(cue_key, (_WORLDS,), jnp.float32)
@@ -186,7 +188,7 @@ _FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "valid")
     [
         ("gru", 1, 0.95, 1.0),
         ("none", 21, 0.95, 1.0),
-        ("none", 20, 0.4, 0.6),  # one too few
+        ("none", 20, 0.4, 0.6),  # one observation too few
         ("none", 1, 0.4, 0.6),
     ],
 )
@@ -218,12 +220,13 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
         return jax.lax.scan(update, state, jax.random.split(jax.random.key(4), _UPDATES))
 
     _, success = train(state)
-    # Chance is 1/2, of 640 episodes within 0.1 of it but once in a million.
+    # Chance is 1/2. The mean of 640 random episodes is off by more than 0.1 with a chance of one in
+    # a million.
     assert low <= float(jnp.mean(success[-10:])) <= high
 
 
 def test_a_memory_that_is_no_number_spoils_nothing() -> None:
-    """Of a robot that takes no part: nothing of it counts."""
+    """Gives a robot without valid samples a memory of NaN, which must change nothing."""
     groups, robots, length = 4, 2, CONFIG.rollout_length
     shape = (groups, length * robots)
     valid = np.tile([True, False], length)
@@ -245,7 +248,7 @@ def test_a_memory_that_is_no_number_spoils_nothing() -> None:
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after.params))
 
 
-# --- what goes with no memory
+# --- settings that do not go with a memory
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Monte-Carlo returns against sums by hand and NumPy."""
+"""Checks Monte-Carlo returns against sums by hand and against NumPy."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,11 +15,11 @@ def _returns(ends: list[int]) -> list[float]:
 
 
 def test_returns_by_hand() -> None:
-    # Halves and powers of two: exact. The tail is cut, as if nothing followed step 4.
+    # Powers of two and their halves are exact. The returns end as if nothing followed step 4.
     assert _returns([]) == [5.0, 8.0, 12.0, 16.0, 16.0]
-    # An end at step 1 keeps what follows from steps 0 and 1 ...
+    # With an end at step 1, the returns of steps 0 and 1 leave out all later rewards.
     assert _returns([1]) == [2.0, 2.0, 12.0, 16.0, 16.0]
-    # ... and one at the last step is what the cut is already.
+    # An end at the last step changes nothing, since no reward follows.
     assert _returns([1, 4]) == _returns([1])
 
 
@@ -48,7 +48,7 @@ def test_returns_are_normalised_over_the_valid_samples() -> None:
     found = np.asarray(normalize(jnp.asarray(returns, jnp.float32), jnp.asarray(valid)))
     inside = returns[valid]
     expected = (inside - inside.mean()) / (inside.std(ddof=1) + 1e-7)
-    # Float32 of values around 3, with a deviation of 2.
+    # float32 rounding of values around 3, with a deviation of 2.
     np.testing.assert_allclose(found[valid], expected, atol=2e-6)
 
 

@@ -1,4 +1,4 @@
-"""Networks against a forward pass in NumPy, the Gaussian against SciPy."""
+"""Checks the networks against a forward pass in NumPy, and the Gaussian against SciPy."""
 
 from collections.abc import Callable
 
@@ -130,7 +130,8 @@ def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() ->
             assert np.abs(kernel).max() <= bound
             assert np.abs(bias).max() <= bound
             assert np.abs(bias).max() > 0.0
-            # 32 and more draws of U(-b, b), deviation b / sqrt(3): within five standard errors.
+            # At least 32 draws from U(-b, b) have the deviation b / sqrt(3), within five standard
+            # errors.
             apart = abs(kernel.std() - bound / np.sqrt(3.0))
             assert apart < 5.0 * bound / np.sqrt(kernel.size)
             assert kernel.max() > 0.7 * bound > -0.7 * bound > kernel.min()

@@ -1,4 +1,4 @@
-"""Running moments against NumPy's moments of all valid observations at once."""
+"""Checks running moments against NumPy's moments of all valid observations at once."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def test_masked_batches_give_the_moments_of_all_valid_observations() -> None:
         state = normalizer.update(state, observation.astype(np.float32), valid)
     expected = np.concatenate(seen)
     assert state.count == len(expected)
-    # float32 against float64: means of order 10, so rounding of order 1e-6.
+    # float32 against float64: means of order 10 have a rounding error of order 1e-6.
     np.testing.assert_allclose(state.mean, expected.mean(axis=0), atol=5e-6)
     np.testing.assert_allclose(state.variance, expected.var(axis=0), rtol=1e-5)
 
@@ -43,8 +43,8 @@ def test_small_deviations_on_a_large_offset_keep_their_variance() -> None:
     state = normalizer.init(1)
     for _ in range(2):
         state = normalizer.update(state, observation, np.ones(3, bool))
-    # Deviations -0.5, 0, 0.5: variance 0.5 / 3. The mean rounds at 1000 * 2**-24 = 6e-5, which
-    # enters squared.
+    # Deviations of -0.5, 0 and 0.5 have a variance of 0.5 / 3. The mean rounds at
+    # 1000 * 2**-24 = 6e-5, which enters the variance squared.
     np.testing.assert_allclose(state.variance, [0.5 / 3.0], rtol=1e-6)
 
 
@@ -55,9 +55,10 @@ def test_normalize_is_shift_scale_and_clip() -> None:
         variance=np.array([4.0, 0.25, 0.0], np.float32),
     )
     observation = np.array([[3.0, -9.0, 5.0], [0.0, 0.5, 5.001]], np.float32)
-    # Column 3 has never moved: it is divided by the smallest deviation, 0.001.
+    # Column 3 has variance 0, so it is divided by the smallest allowed deviation, 0.001.
     expected = [[1.0, -10.0, 0.0], [-0.5, 1.0, 1.0]]
-    # 5.001 - 5 in float32 is off by 2**-22 * 5 / 0.001 = 2.4e-4 at most.
+    # float32 rounds 5.001 by at most 2**-22, so the result is off by at most
+    # 2**-22 / 0.001 = 2.4e-4.
     np.testing.assert_allclose(normalizer.normalize(state, observation, 10.0), expected, atol=5e-4)
 
 
@@ -88,6 +89,6 @@ def test_agrees_with_brax_over_several_batches() -> None:
         valid = jnp.asarray(random.random(40) < 0.7)
         mine = normalizer.update(mine, batch, valid)
         theirs = running_statistics.update(theirs, batch, weights=valid.astype(jnp.float32))
-    # 1e-5: float32; Brax sums squares, this project merges moments.
+    # 1e-5: float32 rounding, since Brax sums squares and this project merges moments.
     np.testing.assert_allclose(mine.mean, np.asarray(theirs.mean), rtol=1e-5)
     np.testing.assert_allclose(mine.std, np.asarray(theirs.std), rtol=1e-5)

@@ -1,4 +1,4 @@
-"""The learning rates that a run begins with."""
+"""Checks the initial learning rates, and the steps that the optimiser takes or skips."""
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,10 @@ from swarmjax.ppo.config import AlgoConfig
     ("updates", "schedule", "actor"),
     [
         (1, "linear", 3e-4),
-        (1875, "linear", 3e-4),  # 15,000 gradient steps of 8 minibatches
+        (1875, "linear", 3e-4),  # 15,000 gradient steps, 8 an update
         (3750, "linear", 1.5e-4),
         (14_648, "linear", 3e-4 * 15_000 / 117_184),
-        (937, "constant", 3e-4),  # a constant rate sums to twice as much
+        (937, "constant", 3e-4),  # a constant rate sums to twice a linear one
         (3750, "constant", 0.75e-4),
     ],
 )

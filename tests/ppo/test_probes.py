@@ -1,6 +1,7 @@
-"""Seven worlds so small that value and best action are known: which part of PPO is broken?
+"""Checks PPO in seven worlds so small that the value and the best action are known.
 
-In the manner of Andy Jones, "Debugging Reinforcement Learning Systems" (2021), probe environments.
+The worlds that fail show which part of PPO is broken. They follow the probe environments of Andy
+Jones, "Debugging Reinforcement Learning Systems" (2021).
 """
 
 import functools
@@ -32,7 +33,7 @@ CONFIG = AlgoConfig(
 
 
 class Probe(NamedTuple):
-    """A world of one number: `draw` (-1 or 1) fixed for an episode, and a clock."""
+    """A world with a number `draw`, -1 or 1 and fixed for an episode, and a clock."""
 
     length: int
     observe: Callable[[jax.Array, jax.Array], jax.Array]
@@ -57,7 +58,7 @@ def _observe(probe: Probe, world: World) -> jax.Array:
 def _act(
     probe: Probe, state: LearnerState, world: World, key: jax.Array
 ) -> tuple[World, dict[str, jax.Array]]:
-    """One step of all worlds, and what there is to learn from it."""
+    """Runs one step of all worlds; returns the new worlds and the samples of the step."""
     noise_key, reset_key = jax.random.split(key)
     observation = _observe(probe, world)
     noise = jax.random.normal(noise_key, (WORLDS, 1))
@@ -126,19 +127,20 @@ def test_critic_learns_a_constant() -> None:
     state = _solve(
         Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: 1.0 + 0.0 * draw)
     )
-    # The target is exactly 1, so only Adam's last, shrinking steps remain.
+    # The target is exactly 1, so only Adam's last, shrinking steps leave an error.
     np.testing.assert_allclose(_values(state, 0.0), [1.0], atol=0.01)
 
 
 def test_critic_learns_from_the_observation() -> None:
     state = _solve(Probe(1, lambda draw, clock: draw, lambda draw, action, clock: draw))
-    # Exact targets, as above.
+    # The targets are exact, so only Adam's last, shrinking steps leave an error.
     np.testing.assert_allclose(_values(state, -1.0, 1.0), [-1.0, 1.0], atol=0.01)
 
 
 def test_a_later_reward_is_discounted() -> None:
     state = _solve(Probe(2, lambda draw, clock: clock, lambda draw, action, clock: clock))
-    # V(clock 1) = 1, V(clock 0) = 0.5 * V(clock 1). Exact targets once the later one is learnt.
+    # V(clock 1) = 1 and V(clock 0) = 0.5 * V(clock 1). The targets are exact once V(clock 1) is
+    # learned.
     np.testing.assert_allclose(_values(state, 0.0, 1.0), [0.5, 1.0], atol=0.01)
 
 
@@ -149,8 +151,9 @@ def test_a_truncated_episode_is_valued_as_if_it_went_on() -> None:
         lambda draw, action, clock: 1.0 + 0.0 * draw,
         ends_by_truncation=True,
     )
-    # 1 + 0.5 + 0.25 + ... = 2; were the cut an end, it would be 1.42 on average. The target moves
-    # with the critic, so it converges more slowly than above.
+    # The value is 1 + 0.5 + 0.25 + ... = 2. If truncation ended the return, the value would be
+    # 1.42 on average. The target moves with the critic, which converges more slowly than with an
+    # exact target.
     np.testing.assert_allclose(_values(_solve(probe), 0.0), [2.0], atol=0.01)
 
 
@@ -158,7 +161,7 @@ def test_actor_learns_the_best_action() -> None:
     state = _solve(
         Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: -((action - 0.5) ** 2))
     )
-    # The noise of gradients that 256 samples make, damped by the falling learning rate.
+    # 0.02: noise of gradients from 256 samples, damped by the falling learning rate.
     np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.02)
 
 
@@ -168,7 +171,7 @@ def test_actor_learns_the_best_action_of_each_observation() -> None:
             1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
         )
     )
-    # As above, with half the samples for each observation.
+    # 0.02: noise of gradients from about 128 samples for each observation.
     np.testing.assert_allclose(_modes(state, -1.0, 1.0), [-0.5, 0.5], atol=0.02)
 
 
@@ -177,9 +180,9 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
         return -((jnp.clip(action, -1.0, 1.0) - 0.5) ** 2)
 
     state = _solve(Probe(1, lambda draw, clock: 0.0 * draw, reward), first=-6.0)
-    # Eight deviations beyond, no draw is within: rewards say nothing there. (From -4 the noise of
-    # advantages that are all alike, normalised, leads some seeds back.)
-    # 0.5 is not quite the best mean, since what is drawn above 1 does as 1 does.
+    # A mean of -6 is eight deviations below -1, so all actions have the same reward. (From -4,
+    # advantages that are all alike become noise when normalised, which leads some seeds back.)
+    # The best mean is not exactly 0.5, since actions above 1 are clipped to 1.
     np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.05)
 
 
@@ -189,7 +192,7 @@ def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -
     probe = Probe(
         1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
     )
-    # As above.
+    # 0.02: noise of gradients, as with autodiff.
     np.testing.assert_allclose(
         _modes(_solve(probe, backend="fused"), -1.0, 1.0), [-0.5, 0.5], atol=0.02
     )

@@ -1,4 +1,4 @@
-"""Policies with memory learn from useful sequences as they do from all, and from no others."""
+"""Checks that policies with memory learn the same from the useful sequences as from all."""
 
 from dataclasses import replace
 from functools import partial
@@ -29,15 +29,15 @@ CONFIG = AlgoConfig(
     epochs=1,
     rollout_length=STEPS,
     entropy_cost=0.01,
-    max_grad_norm=None,  # a clipped gradient would have a right length if it were wrong
+    max_grad_norm=None,  # clipping would give even a wrong gradient the right norm
 )
-# Of 5 robots: two with all steps, one whose last is the fourth, and two that are absent.
+# Of 5 robots, two have all steps, one has only the first four, and two are absent.
 ENDS = np.array([STEPS, STEPS, 4, 0, 0])
 
 
 @pytest.fixture(autouse=True)
 def _small_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sequences, "CPU_TILE", 5)  # 12 sequences: two tiles and a part of one
+    monkeypatch.setattr(sequences, "CPU_TILE", 5)  # 12 sequences: two tiles and part of a third
 
 
 def _batch(seed: int = 0, ends: np.ndarray = ENDS) -> Batch:
@@ -49,7 +49,7 @@ def _batch(seed: int = 0, ends: np.ndarray = ENDS) -> Batch:
 
     valid = np.broadcast_to(np.arange(STEPS)[:, None] < ends, shape)
     begins = np.zeros(shape, bool)
-    begins[1, 5] = begins[2, 2, 1] = True  # borders of episodes, of an arena and of one robot
+    begins[1, 5] = begins[2, 2, 1] = True  # an arena and one robot begin an episode
     return Batch(
         observation=drawn(OBSERVATION),
         action=drawn(ACTION),
@@ -90,7 +90,7 @@ def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int
     found = jax.tree.map(lambda *x: sum(x), *parts)
     whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
     expected = jax.grad(losses.ppo_loss, has_aux=True)(params, whole, CONFIG, count)
-    # Sums of 80 float32 of order 1 to 100 in another order.
+    # Sums of 80 float32 terms of order 1 to 100, added in another order.
     chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -99,7 +99,7 @@ def test_a_learner_learns_as_by_autodiff() -> None:
         _update(_learner(), _batch(), CONFIG, name) for name in ("sequences", "autodiff")
     )
     chex.assert_trees_all_equal_structs(found, expected)
-    # Of Adam's first step, 1e-3 long, gradients that differ by rounding leave a hundredth.
+    # Adam's first step is 1e-3 long. Rounding of the gradients changes it by at most a hundredth.
     chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), found[0].params, _learner().params)
     assert min(jax.tree.leaves(moved)) > 1e-4
@@ -125,12 +125,13 @@ def test_sequences_are_dealt_anew_with_another_key() -> None:
         set(np.asarray(sequences.deal(jax.random.key(seed), useful, 2).order[:24]))
         for seed in (0, 1)
     )
-    # That two halves of 48 drawn at random are the same, or as good as apart, is below 1e-8.
+    # Two random halves of 48 sequences share at most 2 or at least 22 with a probability below
+    # 1e-8.
     assert 2 < len(first & second) < 22
 
 
 def test_a_minibatch_goes_through_its_sequences_and_no_others() -> None:
-    """Each sequence is told by its memory, and each sample by its return."""
+    """Marks each sequence by its memory, and each sample by its return."""
     batch = _batch()
     name = jnp.arange(GROUPS * ROBOTS, dtype=jnp.float32).reshape(GROUPS, 1, ROBOTS)
     step = jnp.arange(STEPS, dtype=jnp.float32)[:, None]
@@ -200,7 +201,7 @@ def test_a_batch_of_nothing_valid_is_no_step() -> None:
 def test_a_minibatch_without_a_sequence_is_no_step() -> None:
     config = replace(CONFIG, num_minibatches=4, epochs=3)
     batch = _batch()
-    alone = jnp.zeros_like(batch.valid).at[2, ROBOTS].set(True)  # robot 0 of an arena, one step
+    alone = jnp.zeros_like(batch.valid).at[2, ROBOTS].set(True)  # one step of robot 0 of an arena
     after, metrics = _update(_learner(), replace(batch, valid=alone), config)
     counts = [
         x for x in jax.tree.leaves(after.optimizer_state) if jnp.issubdtype(x.dtype, jnp.integer)
@@ -212,7 +213,7 @@ def test_a_minibatch_without_a_sequence_is_no_step() -> None:
 
 def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
     config = replace(CONFIG, num_minibatches=2, epochs=2)
-    ends = (ENDS, np.array([3, 0, 0, 0, 0]))  # the second has fewer tiles to go through
+    ends = (ENDS, np.array([3, 0, 0, 0, 0]))  # the second learner has fewer tiles
     batches = [_batch(i, each) for i, each in enumerate(ends)]
     learners = [_learner(i) for i in range(2)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *zip(learners, batches, strict=True))
@@ -220,11 +221,12 @@ def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
     for i, (learner, batch) in enumerate(zip(learners, batches, strict=True)):
         alone = _update(learner, batch, config)
         mine = jax.tree.map(lambda x, i=i: x[i], together)
-        # Products of matrices side by side, through four steps of Adam of up to 1e-3.
+        # Batched matrix products round differently, over four steps of Adam of up to 1e-3 each.
         chex.assert_trees_all_close(mine, alone, rtol=1e-4, atol=1e-5)
 
 
-# s6 with 65,536 arenas, worlds with 4,096 in 32 minibatches, and one arena.
+# Stage s6 with 65,536 arenas, worlds with 4,096 arenas in 32 minibatches, one arena, and a million
+# sequences.
 @pytest.mark.parametrize(
     ("sequences_", "minibatches", "steps", "expected"),
     [(327_680, 8, 32, 10_240), (81_920, 32, 64, 854), (5, 1, 32, 5), (10**6, 1, 32, 62_500)],

@@ -1,4 +1,4 @@
-"""The page in a browser: Chromium without a window, from a file, without a network."""
+"""Tests the replay page in headless Chromium, opened from a file and without a network."""
 
 import json
 from collections.abc import Iterator
@@ -36,7 +36,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Recording]]:
-    """Two levels, by a policy that steers and by one that drives straight ahead."""
+    """Records two levels, each with a policy that steers and one that drives straight ahead."""
     folder = tmp_path_factory.mktemp("policies")
     steer = steering.write(folder / "steer.npz")
     ahead = steering.write(folder / "ahead.npz", steering.AHEAD)
@@ -46,7 +46,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[list[Recording]]:
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) -> Path:
-    """The page of both."""
+    """Writes the page of both levels and both policies."""
     folder = tmp_path_factory.mktemp("page")
     settings = load_levels(ReplayConfig, [f"policy={HOSTILE},ahead.npz", *WORDS])
     trained = policy_file.read(steering.write(folder / "steer.npz"))
@@ -68,7 +68,7 @@ def _open(
     still: bool = True,
     dark: bool = False,
 ) -> None:
-    """Opens the page, for a person who asks for less motion unless it is to play."""
+    """Opens the page; with `still` the browser asks for reduced motion, so nothing plays."""
     wishes = {
         "prefers-reduced-motion": "reduce" if still else "no-preference",
         "prefers-color-scheme": "dark" if dark else "light",
@@ -88,7 +88,7 @@ def _js(browser: Any, expression: str, *arguments: Any) -> Any:
 
 
 def _shade(browser: Any, kind: str, number: int = 0) -> int:
-    """How many colours a canvas shows."""
+    """Returns how many colours a canvas shows."""
     script = """
       const canvas = document.querySelectorAll(arguments[0])[arguments[1]];
       const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -107,10 +107,10 @@ def test_it_opens_from_a_file_and_asks_for_nothing_else(browser, file):
         for each in seen
         if each["method"] == "Network.requestWillBeSent"
     }
-    # The icon is empty, and inside the page.
+    # The icon is empty and inside the page.
     assert asked - {"data:,"} == {file.as_uri()}
     assert _js(browser, "performance.getEntriesByType('resource').map((each) => each.name)") == []
-    assert browser.get_log("browser") == []  # no errors, and nothing that the page forbids itself
+    assert browser.get_log("browser") == []  # no errors, no violations of the page's policy
 
 
 def test_it_plays_at_once(browser, file):
@@ -140,20 +140,22 @@ def test_positions_are_those_that_were_recorded(browser, file, runs):
                 row = min(frame, len(run.pose) - 1)
                 found = np.array(_js(browser, "replay.positions(undefined, arguments[0])", i))
                 error = np.abs(found - run.pose[row])
-                # Half of 0.2 mm and of 1 mrad, and what float64 makes of them.
+                # The page rounds to 0.2 mm and 1 mrad, so errors are at most half of that, plus
+                # float64 rounding.
                 assert error[:, :2].max() <= 1e-4 + 1e-9
                 assert error[:, 2].max() <= 5e-4 + 1e-9
                 _check_numbers(browser, run, frame, row, i)
 
 
 def _check_numbers(browser: Any, run: Recording, frame: int, row: int, i: int) -> None:
-    """Compares distances, rewards and rays."""
+    """Compares the page's distances, rewards and rays with the recording."""
     where = (frame, i)
     distance = _js(browser, "replay.distances(...arguments)", *where)
-    # Position and target are off by half of 0.2 mm and by 5 um along each axis.
+    # Along each axis the position is off by at most half of 0.2 mm, and the target by 5 um.
     np.testing.assert_allclose(distance, run.distance[row], atol=1.05e-4 * 2**0.5)
     reward = sum(term[: row + 1].sum(axis=0) for term in run.reward.values())
-    # Half of 1e-4 of each term, and what float64 makes of it.
+    # The page rounds each term to 1e-4, so a term is off by at most half of that, plus float64
+    # rounding.
     found = _js(browser, "replay.rewards(...arguments)", *where)
     np.testing.assert_allclose(found, reward, atol=0.5e-4 * len(run.reward) + 1e-9)
     rays = np.array(_js(browser, "replay.rays(...arguments)", *where), float)  # null: nan
@@ -167,10 +169,10 @@ def test_robots_are_drawn_where_they_are(browser, file, runs):
     (run, _), frame = runs[0], 40
     _js(browser, "replay.seek(arguments[0])", frame)
     canvas = browser.find_element("css selector", ".arena").size
-    # 22 px are for the scale, and 12 mm of wall are shown all around.
+    # 22 px are reserved for the scale, and 12 mm of wall are shown on every side.
     scale = min(canvas["width"], canvas["height"] - 22) / (run.scene.side + 2 * 0.012)
     for colour, (x, y, yaw) in zip(replay_pack.colours(3), run.pose[frame], strict=True):
-        # Well behind the middle of the robot, where there is neither its number nor its arrow.
+        # This point is behind the robot's centre, away from its number and its arrow.
         x, y = x - 0.022 * np.cos(yaw), y - 0.022 * np.sin(yaw)
         pixel = (canvas["width"] / 2 + scale * x, (canvas["height"] - 22) / 2 - scale * y)
         script = """
@@ -197,7 +199,7 @@ def test_it_plays_to_the_last_frame(browser, file):
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A page of 400 steps, 12.8 s, and of robots whose trails are cut after 10 s."""
+    """Writes a page of 400 steps, 12.8 s, which is longer than the trails of 10 s."""
     folder = tmp_path_factory.mktemp("long")
     settings = load_levels(ReplayConfig, ["policy=a.npz"])
     trained = policy_file.read(steering.write(folder / "steer.npz"))
@@ -228,13 +230,14 @@ def test_a_trail_is_drawn_beyond_its_ten_seconds(browser, long):
       CanvasRenderingContext2D.prototype.beginPath = begin;
       return [bad, longest];
     """
-    # 10 s are 312.5 steps, which round to 313 in JavaScript, and their ends are one more.
+    # 10 s are 312.5 steps, which JavaScript rounds to 313. A line of 313 steps has 314 points.
     assert browser.execute_script(script) == [0, 314]
 
 
 def test_the_numbers_are_those_of_the_picture_once_it_pauses(browser, long):
     _open(browser, long)
-    # At once after a reading of the numbers, of which there is one in 100 ms at most.
+    # The page updates the numbers at most once in 100 ms. This script pauses at a frame for which
+    # the page has not updated the numbers yet.
     script = """
       const done = arguments[0];
       const clock = document.getElementById("clock");
@@ -276,7 +279,7 @@ def test_it_is_played_by_keyboard(browser, file):
     assert _js(browser, "replay.playing")
     press(Keys.SPACE)
     assert not _js(browser, "replay.playing")
-    # A button that has the focus is pressed by the space bar, and is not overruled.
+    # The space bar presses a focused button instead of starting the replay.
     browser.execute_script("document.getElementById('forth').focus()")
     frame = _js(browser, "replay.frame")
     press(Keys.SPACE)
@@ -287,7 +290,8 @@ def test_a_drag_on_a_chart_goes_to_that_time(browser, file):
     _open(browser, file)
     chart = browser.find_element("css selector", ".chart")
     width = chart.size["width"]
-    # The plot lies between 50 pixels on the left and 14 on the right; offsets are from the middle.
+    # The plot has margins of 50 px on the left and 14 px on the right. Offsets are measured from
+    # the middle of the chart.
     middle = 50 + (width - 64) / 2 - width / 2
     drag = ActionChains(browser).move_to_element_with_offset(chart, round(middle) - 60, 0)
     drag.click_and_hold().move_by_offset(60, 0).release().perform()
@@ -310,11 +314,12 @@ def test_it_fits_and_is_drawn(browser, file, width, dark):
     _js(browser, "replay.seek(60)")
     assert _js(browser, "document.documentElement.scrollWidth") <= width
     for number in range(2):
-        # Robots, targets, walls, boxes and the edges between them; an empty canvas has one.
+        # Robots, targets, walls, boxes and their edges have many colours. An empty canvas has one
+        # colour.
         assert _shade(browser, ".arena", number) > 20
         assert _shade(browser, ".chart", number) > 20
     left = [_js(browser, f"document.querySelectorAll('.run')[{i}].offsetLeft") for i in range(2)]
-    assert (left[0] == left[1]) == (width < 760)  # below each other, or side by side
+    assert (left[0] == left[1]) == (width < 760)  # stacked or side by side
     card = _js(browser, "getComputedStyle(document.body).backgroundColor")
     assert card == ("rgb(20, 21, 23)" if dark else "rgb(251, 251, 250)")
 
@@ -337,7 +342,7 @@ def test_a_robot_is_singled_out(browser, file, runs):
     details = _js(browser, "[...document.querySelectorAll('.detail')].map((p) => p.textContent)")
     distance = runs[0][0].distance[last, 1]
     assert details[0].startswith("Robot 2: ")
-    # Three digits are shown of what is off by 0.15 mm at most.
+    # The page shows three decimals, in m, of a distance that is off by at most 0.15 mm.
     assert float(details[0].split()[2]) == pytest.approx(distance, abs=7e-4)
     pressed = "document.querySelectorAll('[aria-pressed=true]').length"
     assert _js(browser, pressed) == 2  # in both views

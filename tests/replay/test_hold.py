@@ -1,4 +1,4 @@
-"""Replays by `task.arrival=hold`: a robot is shown within its target, and beyond it again."""
+"""Tests replays with `task.arrival=hold`, in which a robot enters its target and leaves again."""
 
 import json
 import zlib
@@ -39,10 +39,10 @@ def _settings(policy: Path, *words: str) -> ReplayConfig:
 
 
 class _Driver:
-    """Does what robots of the scene do, in the place of what a policy would."""
+    """Replaces the policy by the actions of the scene in tests/holding.py."""
 
     def init(self, arenas: Arenas) -> None:
-        """Nothing to remember."""
+        """Returns None, since there is no memory."""
 
     def act(self, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
         row = min(int(arenas.outcome.clock[0]), RETURNS - 1)
@@ -55,7 +55,10 @@ def _drive(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def recordings(policy: Path) -> list[Recording]:
-    """The scene, beside one in which robot 1 has far to go; 80 steps at most."""
+    """Records the scene, and a second one in which robot 1's target is far away.
+
+    Both episodes have a limit of 80 steps.
+    """
     with pytest.MonkeyPatch.context() as patch:
         _drive(patch)
         settings = _settings(policy, "task.arrival=hold", "steps=80")
@@ -78,8 +81,9 @@ def test_recording_ends_with_the_last_episode_though_robots_have_left_again(
     settings = _settings(policy, "task.arrival=hold", "steps=140")
     judge = evaluate_judge.load(settings.evaluation, policy_file.read(policy))
     one, steps = holding.level(), []
-    # Robot 0 drives on and is 50 mm from this target, or less, after 38 steps: it is at 120.6 mm
-    # after step 61. By then it has left the one of the other arena, 60 mm away, long ago.
+    # After step 61 robot 0 is at x = 120.6 mm and drives back. In the second arena robot 0 is
+    # within 50 mm of its target at -80 mm after 38 more steps. By then robot 0 of the first arena
+    # has left its target at 60 mm again.
     behind = one._replace(target=np.array([[-0.08, 0.0], one.target[1]], np.float32))
     found = record.record(judge, [one, behind], steps.append)
     assert [len(each.pose) - 1 for each in found] == [RETURNS, holding.TURNED + 38]
@@ -89,12 +93,13 @@ def test_recording_ends_with_the_last_episode_though_robots_have_left_again(
 def test_who_is_within_its_target_is_recorded_step_by_step(recordings: list[Recording]) -> None:
     np.testing.assert_array_equal(recordings[0].arrived[1:], holding.arrived())
     assert recordings[0].arrival.tolist() == [RETURNS, OTHER]
-    # The other robot never gets there; robot 0 is back in time to stay.
+    # In the second scene robot 1 never reaches its target. Robot 0 returns to its target and stays
+    # within it to the end.
     assert recordings[1].arrival.tolist() == [RETURNS, 0]
 
 
 def test_the_reward_is_that_of_training(recordings: list[Recording]) -> None:
-    """The numbers of tests/task/test_hold.py."""
+    """Checks the numbers of tests/task/test_hold.py."""
     total = {name: term.sum(axis=0) for name, term in recordings[0].reward.items()}
     outside = np.array([ENTERS + RETURNS - LEAVES, OTHER])
     np.testing.assert_allclose(total["step_penalty"], -0.25 * outside)
@@ -111,7 +116,7 @@ def _header(packed: bytes) -> dict[str, Any]:
 
 
 def _series(recording: Recording) -> list[str]:
-    """Names of the series of a packed recording."""
+    """Returns the names of the series in a packed recording."""
     (episode,) = _header(pack.pack({}, [replays.episode(recording)], 0.04))["episodes"]
     return [name for name, *_ in episode["runs"][0]["series"]]
 

@@ -1,4 +1,4 @@
-"""Packed recordings say what was recorded, to the quantum, and are small."""
+"""Tests that packed recordings are small and match what was recorded to within a quantum."""
 
 import json
 import zlib
@@ -18,7 +18,7 @@ from swarmjax.replay.record import Recording
 
 
 def _unfold(planes: bytes, rows: int, columns: int, width: int) -> np.ndarray:
-    """Reads a series, straight from its description."""
+    """Decodes a series, written from the description of the format alone."""
     raw = np.frombuffer(planes, np.uint8).reshape(width, columns, rows).astype(np.int64)
     folded = np.einsum("w...,w->...", raw, 256 ** np.arange(width))
     steps = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
@@ -26,7 +26,7 @@ def _unfold(planes: bytes, rows: int, columns: int, width: int) -> np.ndarray:
 
 
 def _unpack(packed: bytes) -> tuple[dict, list[dict[str, np.ndarray]]]:
-    """Reads header and series of all runs."""
+    """Decodes the header and the series of all runs."""
     data = zlib.decompress(packed)
     size = int.from_bytes(data[:4], "little")
     header, at, runs = json.loads(data[4 : 4 + size]), 4 + size, []
@@ -54,7 +54,8 @@ def test_numbers_come_back(table):
 
 
 def test_a_number_takes_no_more_bytes_than_it_needs():
-    # Steps fold to 2 n, or 2 |n| - 1 below 0: 254 and 255 take one byte, 256 two.
+    # A step n folds to 2 n, or to 2 |n| - 1 if n is below 0. 254 and 255 take one byte, and 256
+    # takes two bytes.
     assert [replay_pack.fold("x", np.array([[n]]))[1] for n in (127, -128, 128)] == [1, 1, 2]
 
 
@@ -77,7 +78,7 @@ def test_what_does_not_fit_is_named():
 def _check(recording: Recording, series: dict[str, np.ndarray]) -> None:
     rows, robots = recording.pose.shape[:2]
     for name, i, quantum in (("x", 0, 2e-4), ("y", 1, 2e-4), ("yaw", 2, 1e-3)):
-        # Half a quantum, and what float64 makes of a coordinate.
+        # A coordinate is off by at most half a quantum, plus float64 rounding.
         error = np.abs(series[name] * quantum - recording.pose[..., i])
         assert error.max() <= 0.5 * quantum + 1e-12
     ray = series["ray"].reshape(rows, robots, 8)
@@ -105,7 +106,7 @@ def test_recordings_come_back_to_the_quantum(tmp_path):
     for recording, series, episode in zip(found, runs, header["episodes"], strict=True):
         _check(recording, series)
         assert episode["runs"][0]["arrival"] == recording.arrival.tolist()
-        # Rounded to 1e-5.
+        # The header rounds to 1e-5.
         np.testing.assert_allclose(episode["target"], recording.scene.target, atol=5.1e-6)
         np.testing.assert_allclose(episode["sensor"], recording.scene.sensor, atol=5.1e-6)
 
@@ -116,7 +117,7 @@ def test_sensors_that_are_all_alike_are_listed_once():
 
 
 def test_a_ray_just_below_its_range_is_lit():
-    # A range that is no multiple of the quantum: 0.0402 / 0.0005 = 80.4.
+    # The range is not a multiple of the quantum: 0.0402 / 0.0005 = 80.4.
     assert replay_pack.dark(0.0402) == 81
     recording = replays.wandering(1, 2)
     recording.ray[:] = [[[np.nextafter(0.0402, 0.0)] * 8], [[0.0402] * 8]]
@@ -125,7 +126,7 @@ def test_a_ray_just_below_its_range_is_lit():
 
 
 def test_five_long_episodes_are_small_however_robots_move():
-    # Base64 in the page makes 4 bytes of 3. Random motion cannot be packed well; real one can.
+    # Base64 in the page turns 3 bytes into 4. Random motion compresses badly, real motion well.
     for robots, most in ((5, 1e6), (50, 2e6)):
         one = replays.wandering(robots, 1501)
         packed = replay_pack.pack({}, [replays.episode(one)], 0.04)

@@ -1,4 +1,4 @@
-"""The page is one file that says what it shows, and lets nothing in."""
+"""Tests that the replay page is one file that fetches nothing and keeps hostile text harmless."""
 
 import base64
 import hashlib
@@ -17,7 +17,7 @@ HOSTILE = "</script><script>document.title='in'</script><img src=x onerror=alert
 
 
 class Page(HTMLParser):
-    """Tags with their attributes, and the text in each kind of them."""
+    """Parses a page into tags with attributes, and the texts inside each kind of tag."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -72,7 +72,7 @@ def test_the_page_allows_itself_its_own_script_and_style_alone():
     assert rules["script-src"] == f"'sha256-{_hash(script[0])}'"
     assert rules["style-src"] == f"'sha256-{_hash(style[0])}'"
     assert len(script) == len(style) == 1
-    # Nothing is fetched: the one address in a tag is the empty icon.
+    # Nothing is fetched: the only address in a tag is the empty icon.
     sources = [v for _, attrs in page.tags for k, v in attrs.items() if k in ("src", "href")]
     assert sources == ["data:,"]
     assert not re.search(r"https?:|url\(|@import|fetch\(|XMLHttpRequest|WebSocket", text)

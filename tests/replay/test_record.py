@@ -1,4 +1,4 @@
-"""What is recorded is what the judge saw, and the reward is the one that trains."""
+"""Tests that recordings match what the judge simulates, and rewards match those of training."""
 
 import dataclasses
 from pathlib import Path
@@ -59,10 +59,10 @@ def test_the_reward_is_that_of_training(seed, off):
         "touching": draw.random((6, 3)) < 0.3,
     }
     found = replay_record.terms(Steps(**given), weights)
-    # What a replay leaves out, and says so: it has no map of paths.
+    # A replay has no map of paths, so it leaves out path_progress and says so.
     assert set(found) == set(reward.TERMS) - off - {"path_progress"}
     expected = reward.total(reward.Step(**jax.tree.map(jnp.asarray, given)), weights)
-    # Float32 holds rewards of a few units to some 1e-7.
+    # Float32 rounds rewards of a few units by several 1e-7.
     np.testing.assert_allclose(sum(found.values(), np.zeros(6)), expected, atol=1e-6)
 
 
@@ -78,7 +78,7 @@ def test_equation_3_by_hand():
     )
     paper = RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
     found = replay_record.terms(steps, paper)
-    np.testing.assert_allclose(found["progress"], [0.004, 0.0], atol=1e-12)  # 1 - 0.996 rounds
+    np.testing.assert_allclose(found["progress"], [0.004, 0.0], atol=1e-12)  # rounding of 1 - 0.996
     np.testing.assert_array_equal(found["proximity"], [0.0, -0.001])
     assert list(found) == ["progress", "proximity"]
 
@@ -88,7 +88,7 @@ def test_weights_are_those_of_training(tmp_path):
     path = steering.write(tmp_path / "a.npz")
     trained = policy_file.read(path)
     own = TaskConfig(reward=WEIGHTS)
-    assert replay_record.weights(trained, own) == WEIGHTS  # it does not say
+    assert replay_record.weights(trained, own) == WEIGHTS  # the policy stores no weights
     trained.meta["config"] = stored
     assert replay_record.weights(trained, own) == RewardConfig(contact=-0.02)
     trained.meta["config"] = {"task": [1]}
@@ -121,7 +121,7 @@ def test_a_recording_is_what_the_judge_saw(steer):
         np.testing.assert_array_equal(
             recording.scene.box, level.obstacle[level.obstacle_present].astype(float)
         )
-    # Each robot's sensors sit where this episode has them.
+    # Each episode has its own sensor positions, and the recording holds them.
     nominal, _ = infrared.rays(np.zeros(3), np, None)
     off = found[0].scene.sensor[..., :2] - nominal
     assert 0.0 < np.abs(off).max() < 0.01
@@ -145,7 +145,7 @@ def test_rewards_are_those_of_the_steps(steer):
 
 
 def _with_terms(tmp_path: Path, body: str) -> tuple[Path, str]:
-    """Writes a policy that spins on the spot, trained with terms of an extension, and these."""
+    """Writes an extension's reward terms, and a policy trained with them that spins on the spot."""
     file = extensions.write(tmp_path / "own.py", body)
     terms = {piece.name: piece for piece in extension.load(file).rewards}
     policy = steering.write(
@@ -173,7 +173,7 @@ def commanded(step):
     words = [*replays.SMALL, "level=2", "steps=9", f"extensions={file}"]
     _, (recording,) = replays.recorded(policy, *words)
     turn = np.diff(recording.pose[..., 2], axis=0)
-    # Yaws of up to pi are in float32 on their way.
+    # The term gets yaws of up to pi in float32.
     np.testing.assert_allclose(recording.reward["turned"][1:], 2.0 * turn, atol=2e-6)
     # The policy commands a turn of 1; the clock counts from 1.
     expected = 2.0 * (1.0 + np.arange(1, 10))[:, None].repeat(3, axis=1)

@@ -1,4 +1,4 @@
-"""The command: which levels it chooses, what it writes, and what it refuses."""
+"""Tests the replay command: the levels it chooses, the files it writes, and what it refuses."""
 
 import os
 import subprocess
@@ -54,7 +54,7 @@ def test_the_worst_reached_least_then_touched_most_then_took_longest():
 
 
 def _labels(capsys: pytest.CaptureFixture[str]) -> str:
-    said = capsys.readouterr().out.splitlines()[1]  # the first line says as what it was trained
+    said = capsys.readouterr().out.splitlines()[1]  # the first line states the training's settings
     return said.split(": ", 1)[1].rsplit(";", 1)[0]
 
 
@@ -71,7 +71,7 @@ def test_the_worst_are_replayed(steer, tmp_path, capsys):
     reached = np.array([(each.arrival > 0).sum() for each in every])
     contacts = np.array([each.contacts[-1].sum() for each in every])
     frames = np.array([len(each.pose) for each in every])
-    assert len(set(zip(reached, contacts, frames, strict=True))) > 2  # there is something to tell
+    assert len(set(zip(reached, contacts, frames, strict=True))) > 2  # the levels differ in these
     order = sorted(range(8), key=lambda i: (reached[i], -contacts[i], -frames[i], i))
     assert replay.main([*words, "worst=3", f"out={tmp_path / 'a.html'}"]) == 0
     assert _labels(capsys) == "; ".join(f"level {i}" for i in order[:3])
@@ -94,7 +94,7 @@ def test_policies_replay_the_same_levels(steer, tmp_path):
 
 @pytest.fixture
 def suite(tmp_path: Path) -> Path:
-    """Two cells, of one robot and of two."""
+    """Writes a suite of two cells, with one robot and with two robots."""
     drawn = []
     for robots in (1, 2):
         stage = StageConfig(name=f"r{robots}", robots=robots, side=0.8)
@@ -117,7 +117,7 @@ def suite(tmp_path: Path) -> Path:
 def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
     words = [f"policy={steer}", f"suite={suite}", f"out={tmp_path / 'a.html'}", "workers=1"]
     assert replay.main([*words, "worst=5", "steps=1"]) == 0
-    # No one arrives or touches anything in a single step, so that they come as they stand.
+    # No robot arrives or touches anything in a single step, so the levels keep their order.
     assert _labels(capsys) == "; ".join(
         ["r1, level 4", "r1, level 0", "r1, level 7", "r2, level 4", "r2, level 0"]
     )
@@ -139,13 +139,13 @@ def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
     entrants = trials.read_policies(settings.policies)
     seven, two = replay.replay(settings, entrants, replay.Progress(disable=True))
     assert drawn[:2] == [7, 2]
-    assert set(drawn[2:]) <= {0}  # which the engine is compiled with
+    assert set(drawn[2:]) <= {0}  # the engine is compiled with level 0
     levels = cells.split(every.levels)
     for episode, number in ((seven, 7), (two, 2)):
         scene, level = episode.runs[0].scene, levels[number]
         np.testing.assert_array_equal(scene.target, level.target)
         np.testing.assert_array_equal(scene.box, level.obstacle[level.obstacle_present])
-        # Float32 as drawn, and as the engine has it.
+        # Levels are drawn in float32, which limits how closely the engine's poses match them.
         np.testing.assert_allclose(episode.runs[0].pose[0], level.start, atol=1e-6)
 
 
@@ -182,7 +182,7 @@ def test_a_page_whose_writing_breaks_off_is_as_it_was(steer, tmp_path, monkeypat
 
 def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
     def fail(*_: object) -> None:
-        raise OSError("ffmpeg ended")  # as imageio does, without a number
+        raise OSError("ffmpeg ended")  # imageio gives no error number
 
     monkeypatch.setattr(video, "check", lambda: None)
     monkeypatch.setattr(video, "write", fail)

@@ -1,4 +1,4 @@
-"""The film: its camera, its pictures and its file."""
+"""Tests the replay's video: its camera, its pictures and its file."""
 
 import math
 import os
@@ -29,15 +29,15 @@ def test_the_camera_has_all_of_the_arena_in_its_picture():
         tall = wide = 0.0
         for x in (-1, 1):
             for y in (-1, 1):
-                for z in (0.0, 0.1):  # the height of the walls
-                    # 30 mm of wall; the camera looks along y, 58 degrees down.
+                for z in (0.0, 0.1):  # The height of the walls.
+                    # 30 mm of wall are shown. The camera looks along y, 58 degrees down.
                     px, py = x * (side / 2 + 0.03), y * (side / 2 + 0.03)
                     down = math.radians(58.0)
                     depth = away + py * math.cos(down) - z * math.sin(down)
                     tall = max(tall, abs(py * math.sin(down) + z * math.cos(down)) / depth)
                     wide = max(wide, abs(px) / depth)
         field = math.tan(math.radians(20.0))
-        # One of the two fits exactly, with the margin of 6 %.
+        # Either the height or the width fits exactly, with a margin of 6 %.
         share = max(tall / field, wide / (field * aspect))
         assert share == pytest.approx(1 / 1.06, rel=1e-9)
 
@@ -45,10 +45,10 @@ def test_the_camera_has_all_of_the_arena_in_its_picture():
 def test_pictures_are_spread_evenly_over_time():
     settings = _settings("task.control_step=0.1", "video_speed=2")
     episode = replays.episode(replays.wandering(1, 11), replays.wandering(1, 6))
-    # Two seconds of the film are 30 pictures of 1/15 s each: 10 steps of 0.1 s make 15.
+    # At double speed a picture lasts 1/15 s of the episode, so 10 steps of 0.1 s make 15 pictures.
     rows = video.rows(settings, episode.runs)
     assert rows[:15] == [math.floor(k / 1.5) for k in range(15)]
-    assert rows[15:] == [10] * 30  # and one second of the end
+    assert rows[15:] == [10] * 30  # the last frame is held for one second
     assert video.count(settings, [episode] * 2) == 90
 
 
@@ -80,14 +80,14 @@ def test_without_opengl_or_ffmpeg_it_says_what_to_install(monkeypatch):
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    with pytest.raises(ConfigError, match=r"^video needs OpenGL, which MUJOCO_GL=glfw does not"):
+    with pytest.raises(ConfigError, match=r"^video needs OpenGL, but MUJOCO_GL=glfw does not "):
         video.check()
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"^video needs imageio .* uv sync --extra video\.$"):
         video.check()
 
 
-# MuJoCo chooses its OpenGL when it is imported, so that a process of its own is needed.
+# MuJoCo chooses its OpenGL when it is imported, so the test needs a separate process.
 _FILM = """
 import sys
 try:
@@ -135,17 +135,18 @@ def test_a_film_shows_the_robots(tmp_path):
     assert done.returncode == 0, done.stderr
     with np.load(found) as arrays:
         count, picture = int(arrays["count"]), arrays["picture"].astype(int)
-    # Three steps of 0.032 s, half as fast: 5.76 pictures of 1/30 s; 0.1 s of the end.
+    # Three steps of 0.032 s at half speed make 5.76 pictures of 1/30 s. The last frame is held for
+    # 0.1 s.
     assert count == 6 + 3
     assert picture.shape == (240, 2 * 320, 3)
     for half in (picture[:, :320], picture[:, 320:]):
         red = (half[..., 0] > 120) & (half[..., 1:].max(axis=-1) < 80)
-        rows, columns = np.nonzero(red)  # the ring of robot 1, which touches: beyond, to the right
+        rows, columns = np.nonzero(red)  # the ring of robot 1, upper right
         assert len(rows) > 10
         assert rows.mean() < 120
         assert columns.mean() > 160
         blue = (half[..., 2] > 100) & (half[..., 2] > 2 * half[..., 0])
-        rows, columns = np.nonzero(blue)  # robot 0: near, to the left
+        rows, columns = np.nonzero(blue)  # robot 0, lower left
         assert len(rows) > 50
         assert rows.mean() > 120
         assert columns.mean() < 160

@@ -1,4 +1,4 @@
-"""The figures of a report: what they show, taken from the artists that draw it."""
+"""Checks the figures of a report through the Matplotlib artists that draw them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ def _stages(cells: list[tuple[int, int, float]]) -> tuple[StageConfig, ...]:
 
 
 def _wide_row(success: list[float | None], **given: object) -> dict:
-    """A row of as many stages as there are shares of success, arenas spread evenly."""
+    """Returns a row with a stage for each share of success, and arenas spread evenly."""
     count = len(success)
     lists = {key: [None] * count for key in row(0) if key.endswith("_by_stage")}
     even = {"mix": [1] * count, "weights": [1.0 / count] * count}
@@ -38,7 +38,7 @@ def _wide_row(success: list[float | None], **given: object) -> dict:
 
 
 def _lines(panel: Axes, colour: str, style: str) -> list[np.ndarray]:
-    """Curves [points, 2] of one colour and style, undrawn points left out."""
+    """Returns the curves [points, 2] of one colour and style, without undrawn points."""
     found = [line for line in panel.lines if line.get_color() == colour]
     points = [np.asarray(line.get_xydata()) for line in found if line.get_linestyle() == style]
     return [each[~np.isnan(each[:, 1])] for each in points]
@@ -64,12 +64,13 @@ def test_the_mix_is_stacked_as_the_mean_over_seeds(tmp_path: Path) -> None:
 
 
 def test_many_updates_are_averaged_and_none_is_left_out(tmp_path: Path) -> None:
-    # Every tenth update is on the other stage: ten times as many updates as bands have points.
+    # Every tenth update is on the other stage. There are ten times as many updates as points of a
+    # band.
     rows = [row(i, mix=[0, 8] if i % 10 == 3 else [8, 0]) for i in range(2000)]
     figure = report_figures.mix(_history(tmp_path, rows))
     band = figure.axes[0].collections[1]
     heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
-    # 199 stretches of 9 to 11 updates hold one or two of them, or none.
+    # Each of 199 stretches of 9 to 11 updates holds none, one or two updates of the other stage.
     assert heights.min() > 1.0 - 2.5 / 9
     assert (heights < 1.0).mean() > 0.4  # half of the outline is the lower edge
 
@@ -88,11 +89,11 @@ def test_success_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> 
     figure = report_figures.success(_history(tmp_path, rows))
     pair, trio = figure.axes
     [bold] = _lines(pair, BOLD, "-")
-    # The middle two of four; float32 in the rows.
+    # The interquartile mean of four is the mean of the middle two. Rows hold float32.
     assert bold == pytest.approx(np.array([[64, 0.3], [128, 0.5]]), rel=1e-6)
     assert [line[0, 1] for line in _lines(pair, THIN, "-")] == pytest.approx(shares, rel=1e-6)
     assert pair.get_title(loc="left") == "pair   50 %"
-    # The second stage has no arenas: what is known of it is dotted; and one seed knows nothing.
+    # The second stage has no arenas, so its earlier success is dotted. One seed has no success.
     assert [len(line) for line in _lines(trio, BOLD, ":")] == [0]
     assert [len(line) for line in _lines(trio, THIN, ":")] == [0, 1, 1, 1]
     assert trio.get_title(loc="left") == "trio   25 %"
@@ -104,7 +105,8 @@ def test_what_a_stage_was_left_with_is_dotted(tmp_path: Path) -> None:
         for i in range(10)
     ]
     pair, trio = report_figures.success(_history(tmp_path, rows)).axes
-    # Two cohorts of two updates after update 0, at which it last had arenas.
+    # The stage last had arenas at update 0. Its line stays solid for two more cohorts, of two
+    # updates each.
     [[*lately]], [[*left]] = _lines(pair, BOLD, "-"), _lines(pair, BOLD, ":")
     assert [x for x, _ in lately] == [64 * (i + 1) for i in range(5)]
     assert [x for x, _ in left] == [64 * (i + 1) for i in range(5, 10)]
@@ -129,7 +131,8 @@ def test_a_panel_for_each_of_many_stages(tmp_path: Path) -> None:
     shown = [panel for panel in figure.axes if panel.get_visible()]
     titles = [panel.get_title(loc="left").split()[0] for panel in shown]
     assert titles == [stage.name for stage in stages]
-    # 8 to a row: below the last ones of a row that is not full stand the steps as well.
+    # Each row has 8 panels. The last panel of each column is labelled with the steps, even where
+    # the last row is not full.
     labelled = [panel.xaxis.get_tick_params()["labelbottom"] for panel in shown]
     assert labelled == [False] * 26 + [True] * 8
 
@@ -143,7 +146,7 @@ def test_a_grid_shows_the_last_success_of_each_cell(tmp_path: Path) -> None:
     assert figure is not None
     none, two, _ = figure.axes
     assert (none.get_title(), two.get_title()) == ("0 obstacles", "2 obstacles")
-    # Rows are 2 and 3 robots, columns 0.5 and 1 m.
+    # Rows stand for 2 and 3 robots, columns for 0.5 and 1 m.
     assert [text.get_text() for text in none.texts] == ["10", "20", "", "-"]
     assert [text.get_text() for text in two.texts] == ["", "40", "", "50"]
     expected = np.ma.masked_invalid([[np.nan, 0.4], [np.nan, 0.5]]).astype(np.float32)
@@ -155,9 +158,9 @@ def test_a_grid_shows_the_last_success_of_each_cell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cells", "is_grid"),
     [
-        (CELLS, True),  # 5 of 2 x 2 x 2
-        ([(2, 0, 0.5), (3, 0, 0.7), (2, 2, 1.0)], False),  # 3 of 2 x 2 x 3
-        ([(2, 0, 0.5), (2, 0, 0.7), (2, 0, 1.0)], False),  # a row
+        (CELLS, True),  # 5 of 2 x 2 x 2 cells
+        ([(2, 0, 0.5), (3, 0, 0.7), (2, 2, 1.0)], False),  # 3 of 2 x 2 x 3 cells
+        ([(2, 0, 0.5), (2, 0, 0.7), (2, 0, 1.0)], False),  # a single row
         ([(5, 3, 1.2)], False),
     ],
 )
@@ -197,7 +200,7 @@ def test_a_long_curve_is_averaged_and_nothing_is_left_out(tmp_path: Path) -> Non
     rows = [row(i, entropy=10.0 if i == 777 else 0.0) for i in range(2000)]
     [bold] = _lines(_panel(_history(tmp_path, rows), "entropy of the policy"), BOLD, "-")
     assert len(bold) == 200
-    assert bold[:, 1].max() == pytest.approx(1.0, rel=0.2)  # 10 in a stretch of about ten
+    assert bold[:, 1].max() == pytest.approx(1.0, rel=0.2)  # one 10 in about ten updates
 
 
 def test_a_run_without_these_numbers_has_no_curves(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a report shows of a curriculum over levels: figures over time, and pictures."""
+"""Checks what a report shows of a curriculum over levels: figures over time, and pictures."""
 
 import json
 from dataclasses import replace
@@ -78,7 +78,7 @@ def test_pictures_show_the_levels_with_the_best_scores(tmp_path: Path) -> None:
     titles = [axis.get_title() for axis in figure.axes]
     told = "pair\n50 % of 4, score 0.2, mutation 1"
     assert titles == [told, told, ""]  # no level of the other stage is kept
-    # The wall around, and a disc and a circle for each of two robots.
+    # The patches are the wall, and a disc and a circle for each of two robots.
     assert len(figure.axes[0].patches) == 1 + 2 * 2
     centre = figure.axes[0].patches[1].get_center()  # pyright: ignore[reportAttributeAccessIssue]
     arrays = task_stage.single(TRAINED.stage[0])

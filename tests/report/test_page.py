@@ -1,4 +1,4 @@
-"""The page of a report: read as a browser would, it says what the run came to."""
+"""Checks the page of a report, parsed as by a browser, for the results of the run."""
 
 import base64
 import re
@@ -16,7 +16,7 @@ FIGURES = {"mix": b"\x89PNG-mix", "success": b"\x89PNG-success"}
 
 
 class Page(HTMLParser):
-    """Tags with their attributes, and the texts of table cells and facts."""
+    """A parsed page: its tags with attributes, and the texts of its table cells and facts."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class Page(HTMLParser):
             self.words.append(data.strip())
 
     def fact(self, name: str) -> str:
-        """What stands beside a name in the summary."""
+        """Returns the text after a name in the summary."""
         return self.words[self.words.index(name) + 1]
 
 
@@ -59,11 +59,11 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
     page = _page(_history(tmp_path, rows, decisions))
     assert page.fact("stages") == "2: pair to trio"
     assert page.fact("seeds") == "0 to 2"
-    # 20 updates of 64 steps in all; 30 s an update.
+    # The budget is 20 updates of 64 steps; an update takes 30 s.
     assert page.fact("trained") == (
         "4 of 20 updates, 256 arena control steps per seed, 8 arenas, 2 min 00 s"
     )
-    # Three values or fewer are not trimmed: the mean of 0.5 and 0.625 is 0.5625.
+    # At most three values are not trimmed, and the mean of 0.5 and 0.625 is 0.5625.
     assert page.fact("last stage") == (
         "trio: targets reached 56.2 % (interquartile mean of 2 of 3 seeds, 50.0 % to 62.5 %)"
     )
@@ -115,7 +115,7 @@ def test_promotions_are_tabled_and_reweighings_summed_up(tmp_path: Path) -> None
         {"seed": 0, "update": 9, "why": "reweighed", "weights": weights},
     ]
     rows = _page(_history(tmp_path, [row(0)], decisions)).rows
-    # 64 arena control steps an update.
+    # An update is 64 arena control steps.
     assert ["1", "4", "256", "pair", "trio", "threshold", "87.5 %", "75.0 %"] in rows
     assert ["0", "6", "384", "trio", "pair", "demotion", "-", "-"] in rows
     assert ["0", "2", "10", "n9 9.0 %, n8 8.0 %, n7 7.0 %, n6 6.0 %, n5 5.0 %"] in rows

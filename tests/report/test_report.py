@@ -1,4 +1,4 @@
-"""`swarmjax.report` from its command line."""
+"""Checks `swarmjax.report` by its command line."""
 
 import json
 import subprocess
@@ -70,11 +70,11 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
         (["run=good", "step=1"], "step is not a key: give one of run, runs, out, send."),
-        (["runs=good,gone"], "runs is 'good,gone', but 'gone' neither is nor holds a run."),
-        (["runs=g*,none*"], "runs is 'g*,none*', but 'none*' neither is nor holds a run."),
+        (["runs=good,gone"], "runs is 'good,gone', but 'gone' names neither a run nor a "),
+        (["runs=g*,none*"], "runs is 'g*,none*', but 'none*' names neither a run nor a "),
         (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),
-        (["runs=good,,cut"], "runs is 'good,,cut', but '' neither is nor holds a run."),
-        (["runs=good,same"], "seed 0 is in good and in same, of the same settings: give one of"),
+        (["runs=good,,cut"], "runs is 'good,,cut', but '' names neither a run nor a "),
+        (["runs=good,same"], "seed 0 is in good and in same, which have the same settings: "),
         (["runs=good,empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["runs=good", "out=file"], "out is file, which cannot be written: File exists."),
     ],

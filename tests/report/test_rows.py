@@ -1,4 +1,4 @@
-"""What a report reads of a run."""
+"""Checks what a report reads of a run."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_success_is_what_the_curriculum_decides_by(tmp_path: Path) -> None:
 
 
 def test_updates_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
-    rows = [row(0, 0), row(1, 0), row(0, 1), row(1, 1), row(2, 0)]  # stopped between two lines
+    rows = [row(0, 0), row(1, 0), row(0, 1), row(1, 1), row(2, 0)]  # killed within update 2
     history = report_rows.read(write(tmp_path, rows))
     assert history.updates.tolist() == [0, 1]
     assert history.mix.shape == (2, 2, 2)
@@ -75,12 +75,12 @@ def test_a_verdict_is_of_the_networks_as_they_are_for_two_cohorts(tmp_path: Path
     # A cohort is two updates, and the first stage loses its arenas after update 1.
     rows = [row(i, weights=[1.0, 0.0] if i <= 1 else [0.0, 1.0]) for i in range(8)]
     lately = report_rows.trained_lately(report_rows.read(write(tmp_path, rows)))
-    assert lately[0, :, 0].tolist() == [True] * 6 + [False] * 2  # 1 + 4 is the last
+    assert lately[0, :, 0].tolist() == [True] * 6 + [False] * 2  # update 1 + 4 is the last
     assert lately[0, :, 1].tolist() == [False] * 2 + [True] * 6
 
 
 def test_seeds_are_put_together_where_all_have_a_value() -> None:
-    # Of four values the middle two: (2 + 3) / 2; a mean would be 27.5.
+    # The interquartile mean of four values is (2 + 3) / 2; their mean would be 27.5.
     values = np.array([[1.0, 1.0], [2.0, NAN], [3.0, 1.0], [104.0, 1.0]])
     np.testing.assert_array_equal(report_rows.together(values), [2.5, NAN])
 
@@ -181,7 +181,7 @@ def test_a_decision_that_does_not_fit_is_named(given: dict, what: str, tmp_path:
 
 @pytest.mark.parametrize("cut", [1, 20])
 def test_an_unfinished_last_line_is_skipped(cut: int, tmp_path: Path) -> None:
-    # Only its newline is missing, or more: it counts as not written in either case.
+    # A line without its newline counts as not written, whether or not more of it is missing.
     found = [{"seed": 0, "update": update, "why": "threshold"} for update in range(3)]
     write(tmp_path, [row(0), row(1), row(2)], found)
     for name in ("metrics.jsonl", "curriculum.jsonl"):

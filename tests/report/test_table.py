@@ -1,4 +1,4 @@
-"""Several runs in one table."""
+"""Checks the table of several runs."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ MORE = dataclasses.replace(CONFIG, algo=dataclasses.replace(CONFIG.algo, epochs=
 
 
 def _rows(*success: float | None, first: int = 0) -> list[dict]:
-    """Two updates of a seed for each success of the last stage."""
+    """Returns two updates for each seed; the second has the seed's success on the last stage."""
     return [
         row(update, first + seed, success_by_stage=[0.9, each if update else None])
         for update in (0, 1)
@@ -29,7 +29,7 @@ def _rows(*success: float | None, first: int = 0) -> list[dict]:
 
 
 def _array(folder: Path, jobs: list[list[float]], trained: TrainConfig = CONFIG) -> Path:
-    """Writes what an array of jobs does: some seeds each, a folder each."""
+    """Writes the runs of an array of jobs, each with its own seeds and its own folder."""
     for job, success in enumerate(jobs):
         first = job * len(success)
         config = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""What the arms of a reproduction are."""
+"""Tests the training settings of a reproduction's arms."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The report in a browser: Chromium without a window, from a file, without a network."""
+"""Tests the report in headless Chromium, opened from a file and without a network."""
 
 import json
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of the two arms that the paper compares."""
+    """Writes the report of the two arms that the paper compares."""
     out = tmp_path_factory.mktemp("out")
     return reproduce_page.write(whole(out, arms=("curriculum", "baseline")))
 
@@ -43,9 +43,9 @@ def test_it_opens_from_a_file_and_asks_for_nothing_else(browser: Any, file: Path
         if each["method"] == "Network.requestWillBeSent"
     }
     assert file.as_uri() in asked
-    # All else is inside the page.
+    # Everything else is inside the page.
     assert all(url == file.as_uri() or url.startswith("data:") for url in asked)
-    assert browser.get_log("browser") == []  # nothing that the page forbids itself
+    assert browser.get_log("browser") == []  # no violation of the page's content policy
 
 
 def test_its_figures_are_shown(browser: Any, file: Path) -> None:

@@ -1,4 +1,4 @@
-"""Verdicts follow the data: they turn when the data are turned, and stay open where it is open."""
+"""Tests that verdicts reverse when the data are reversed, and stay open where data are unclear."""
 
 import math
 
@@ -25,12 +25,12 @@ BY_NAME = {claim.name: claim for claim in CLAIMS}
 
 
 def _three(*values: float) -> np.ndarray:
-    """Three seeds: alike if one value is given."""
+    """Returns the values of three seeds, all equal if one value is given."""
     return np.array(values if len(values) == 3 else values * 3)
 
 
 def _steady_from(number: int) -> list:
-    """Three seeds that fail until an episode, and never again; 60 episodes."""
+    """Returns logs of three seeds with 60 episodes each that succeed from episode `number` on."""
     return [log([False] * (number - 1) + [True] * (61 - number))] * 3
 
 
@@ -38,8 +38,8 @@ def _outcome(data: Reproduction, name: str) -> Outcome:
     return claims.verdict(data, BY_NAME[name]).outcome
 
 
-# With three seeds the interval of an interquartile mean goes from the lowest to the highest: one
-# resample of 27 is a seed thrice.
+# With three seeds the interval of an interquartile mean goes from the lowest to the highest value,
+# since one of 27 resamples holds the lowest value three times, and one the highest.
 @pytest.mark.parametrize(
     ("values", "holds"),
     [
@@ -58,7 +58,8 @@ def test_the_numbers_are_said() -> None:
     _, text = at_least(_three(0.7, 0.8, 0.9), _three(1.0), least=0.8)
     assert text == "80.0 % (70.0 to 90.0) and 100.0 % (100.0 to 100.0)"
     _, text = higher(_three(0.75), _three(0.25, 0.5, 0.25), unit=SHARE)
-    # Interquartile means of three are means: 0.75 - 1 / 3, and 0.75 - 0.5 to 0.75 - 0.25.
+    # The interquartile mean of three values is their mean. The difference of the means is
+    # 0.75 - 1 / 3, and its interval goes from 0.75 - 0.5 to 0.75 - 0.25.
     assert text == "75.0 % against 33.3 %, difference +41.7 points (+25.0 to +50.0)"
     _, text = earlier(_three(300.0), _three(math.inf))
     assert text == "300 against never, probability of being earlier 1 (1 to 1)"
@@ -92,11 +93,12 @@ def test_about_six_hundred_is_three_hundred_to_nine_hundred(
     ("ours", "theirs", "holds"),
     [
         (_three(0.9), _three(0.8), True),
-        # Paired: each seed has 0.1 more, though the seeds overlap.
+        # Seeds are compared in pairs: each has 0.1 more, although the ranges of the arms overlap.
         (_three(0.2, 0.5, 0.9), _three(0.1, 0.4, 0.8), True),
         (_three(0.2, 0.5, 0.9), _three(0.3, 0.4, 0.8), None),
         (_three(0.8), _three(0.8), None),
-        # The same values in another order: sums of them differ in their last digit alone.
+        # Both arms have the same values in different orders, so their sums differ only in the last
+        # digit.
         (_three(0.7, 0.1, 0.2), _three(0.2, 0.7, 0.1), None),
         (_three(0.7), _three(0.8), False),
     ],
@@ -138,7 +140,7 @@ def test_crowding_is_contradicted_but_never_proven(more: float, holds: bool | No
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_verdicts_turn_with_the_data(turned: bool) -> None:
-    """The curriculum is better in all, and then the baseline is."""
+    """Makes the curriculum better in every measure, and with `turned` the baseline."""
     good = {"targets_reached": 0.9, "sensed_share": 0.1, "contacts_per_robot": 1.0}
     bad = {"targets_reached": 0.4, "sensed_share": 0.2, "contacts_per_robot": 2.0}
     ours, theirs = (bad, good) if turned else (good, bad)
@@ -198,7 +200,7 @@ def test_the_reward_is_compared_from_the_beginning_of_the_run() -> None:
     assert _outcome(reproduction({"curriculum": slow, "baseline": fast}), "faster_reward") == (
         "not reproduced"
     )
-    # As fast, but late on the last stage.
+    # This run has the same high reward from the start, but it reaches the last stage late.
     stage = np.array(["paper1"] * 40 + [LAST] * 40)
     late = [log([True] * 80, reward=rewarded(1.0, 1.0), stage=stage)] * 3
     assert _outcome(reproduction({"curriculum": late, "baseline": fast}), "faster_reward") == (

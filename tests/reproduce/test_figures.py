@@ -1,4 +1,4 @@
-"""The figures of a reproduction: what they show, taken from the artists that draw it."""
+"""Tests what the figures of a reproduction show, read from their Matplotlib artists."""
 
 import io
 import math
@@ -20,12 +20,12 @@ PAIR = ("curriculum", "baseline")
 
 
 def test_a_column_shows_what_ended_in_it_or_was_under_way() -> None:
-    # Ends at 100, 250, 260 and 420.
+    # The episodes end at 100, 250, 260 and 420 arena steps.
     one = log([True, False, True, True], arena_steps=np.array([100, 250, 260, 420]))
     edges = np.array([0.0, 100.0, 200.0, 300.0, 400.0, 500.0, 600.0])
     found = columns(one, measures.first_reached, "steps", None, edges)
-    # 100 lies in the first; in the second the episode that ends at 250 is under way; in the third
-    # one of two succeeds; nothing follows 420.
+    # The end at 100 lies in the first column. In the second column the episode that ends at 250 is
+    # under way. In the third column one of two episodes succeeds. No episode follows after 420.
     np.testing.assert_array_equal(found, [1.0, 0.0, 0.5, 1.0, 1.0, math.nan])
 
 
@@ -49,17 +49,17 @@ def test_a_raster_has_a_row_a_seed_and_a_column_an_episode() -> None:
     shown = np.ma.filled(np.ma.asarray(panels[0].images[0].get_array()), np.nan)
     np.testing.assert_array_equal(shown[0], [0.0] * 10 + [1.0] * 30)
     np.testing.assert_array_equal(shown[2], [0.0] * 30 + [np.nan] * 10)
-    # Four failures of the first window may be left over: episode 7. A seed that never gets there
-    # has no mark.
+    # A window may hold four failures, so success is steady from episode 7 on. A seed that never
+    # becomes steady has no mark.
     marks = np.ma.filled(np.ma.asarray(panels[0].collections[0].get_offsets()), np.nan)
     np.testing.assert_array_equal(marks[np.isfinite(marks[:, 0])], [[7, 0], [7, 1]])
-    # The paper's numbers.
+    # The vertical lines mark the paper's numbers.
     lines = [np.asarray(panel.lines[0].get_xdata())[0] for panel in panels]
     assert lines == [300, 600, 300, 600]
 
 
 def _curve(figure: Figure, place: int, width: float) -> list[np.ndarray]:
-    """Curves [points, 2] of a panel that are so thick."""
+    """Returns the curves [points, 2] of a panel that have this line width."""
     lines = figure.axes[place].lines
     return [np.asarray(each.get_xydata()) for each in lines if each.get_linewidth() == width]
 
@@ -77,7 +77,7 @@ def test_curves_are_rolling_means_and_their_interquartile_mean() -> None:
     assert [line[0].tolist() for line in thin] == [[20, 1.0], [20, 2.0], [20, 6.0]]
     assert [len(line) for line in thin] == [11] * 3
     [thick] = _curve(figure, 0, 2.0)
-    # Of three none is trimmed.
+    # The interquartile mean of three values trims none.
     np.testing.assert_array_equal(thick, [[number, 3.0] for number in range(20, 31)])
     [thick] = _curve(figure, 1, 2.0)
     assert thick[[0, -1]].tolist() == [[2000, 3.0], [3000, 3.0]]
@@ -114,7 +114,7 @@ def test_figures_of_arms_that_have_not_finished_are_left_out(drawn: dict[str, by
 
 
 def test_arms_keep_their_colours_in_the_file() -> None:
-    # A palette of few colours must not merge those that tell arms apart, however short their lines.
+    # The palette of few colours must keep the arms' colours apart, even for short lines.
     random = np.random.default_rng(0)
     arms = (*PAIR, "modern_curriculum", "modern_baseline")
     logs = {}
@@ -126,5 +126,5 @@ def test_arms_keep_their_colours_in_the_file() -> None:
     image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float).reshape(-1, 3)
     for arm in arms:
         colour = 255 * np.array(to_rgb(figures.COLOURS[arm]))
-        # As far as the palette may be off: 9 of 255 here, and 48 if it were chosen by the median.
+        # The palette's colours are off by up to 9 of 255 here. The median cut's are off by 48.
         assert np.abs(image - colour).max(axis=1).min() <= 12, arm

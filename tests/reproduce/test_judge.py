@@ -1,4 +1,4 @@
-"""Policies of a reproduction on levels that differ by the noise of their sensors alone."""
+"""Tests judging a reproduction's policies on levels that differ only in their sensor noise."""
 
 import json
 from pathlib import Path
@@ -24,7 +24,10 @@ RADIUS = TaskConfig().target_radius
 
 
 def _play(tmp_path: Path, drive: tuple) -> tuple:
-    """Four episodes of two robots in 0.6 m: what `play` and `simulate` make of them."""
+    """Runs four episodes of two robots in an arena of 0.6 m by `play` and by `simulate`.
+
+    Returns both results and the robots' distances to their targets at the start.
+    """
     path = steering.write(tmp_path / "policy.npz", drive)
     stage = StageConfig(name="pair", robots=2, side=0.6)
     settings = EvaluateConfig(
@@ -40,11 +43,11 @@ def test_episodes_are_those_of_the_judge(tmp_path: Path) -> None:
     (outcome, nearer), expected, away = _play(tmp_path, STEER)
     for name, mine, theirs in zip(outcome._fields, outcome, expected, strict=True):
         np.testing.assert_array_equal(mine, theirs, err_msg=name)
-    # One that has arrived crossed the radius in its last step, by a stride at most; float32
-    # levels.
+    # A robot that has arrived crossed the target's radius in its last step, by at most one stride.
+    # 1e-6 m allows for levels in float32.
     arrived = outcome.arrived
     assert arrived.any()
-    assert len(set(outcome.clock.tolist())) > 1  # some are over before others
+    assert len(set(outcome.clock.tolist())) > 1  # episodes have different lengths
     left = (away - nearer)[arrived]
     assert (left <= RADIUS + 1e-6).all()
     assert (left >= RADIUS - STRIDE - 1e-6).all()
@@ -72,7 +75,8 @@ def test_a_row_says_what_became_of_a_policy(tmp_path: Path) -> None:
             "arm": "baseline", "seed": 3, "stage": stage, "episodes": 2, "steps": 5.0
         }  # fmt: skip
         assert row["targets_reached"] == row["all_reached"] == 0.0
-        # Equation 3 of robots that stay: what is in infrared range costs 0.001 a step, of 5.
+        # By equation 3 a robot that stays loses 0.001 in each of the 5 steps in which its infrared
+        # sensors see something.
         assert row["return"] == pytest.approx(-0.005 * row["sensed_share"], abs=1e-9)
 
 

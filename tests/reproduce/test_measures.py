@@ -1,4 +1,4 @@
-"""Success, its steady state and rolling means, against numbers worked out by hand."""
+"""Tests success, its steady state and rolling means against numbers computed by hand."""
 
 import math
 
@@ -30,7 +30,7 @@ def test_measures_of_an_episode() -> None:
         "targets": [2 / 2, 2 / 3, 1 / 3],
         "first_reward": [1.0, 0.25, -1.0],
         "mean_reward": [1.5 / 2, 1.5 / 3, 0.0],
-        "sensed_share": [50 / 200, 100 / 400, 0.0],  # no robot steps at all: none with anything
+        "sensed_share": [50 / 200, 100 / 400, 0.0],  # a share of no robot steps is 0
         "contacts": [4 / 2, 3 / 3, 0.0],
     }
     for name, expected in found.items():
@@ -48,14 +48,17 @@ def test_rolling_means() -> None:
 @pytest.mark.parametrize(
     ("success", "expected"),
     [
-        # Windows of 4 hold 2, 3, 3, 3, 3, 3 and 3 successes; three are enough.
+        # Windows of 4 episodes hold 2, 3, 3, 3, 3, 3 and 3 successes, and three are enough.
         ([0, 1, 1, 0, 1, 1, 1, 0, 1, 1], 1),
         ([1, 1, 1, 1], 0),
-        # 4, 3, 2, 2 and 2: two of four are kept, and six of eight are enough.
+        # Windows hold 4, 3, 2, 2 and 2 successes. A window with two of four does not end the steady
+        # state, and six successes in all eight episodes are enough.
         ([1, 1, 1, 1, 0, 0, 1, 1], 0),
-        # Five of eight from the first window on, and four of seven: too few to the end.
+        # From the first window to the end five of eight episodes succeed, and from the second
+        # window four of seven. Both are too few.
         ([1, 1, 1, 1, 0, 0, 1, 0], None),
-        # 4, 3, 2, 1, 1, 2 and 3: one of four loses it, and the good beginning does not count.
+        # Windows hold 4, 3, 2, 1, 1, 2 and 3 successes. A window with one of four ends the steady
+        # state, so the good beginning does not count.
         ([1, 1, 1, 1, 0, 0, 0, 1, 1, 1], 6),
         ([1, 1, 1, 1, 0, 0, 0, 1, 1], None),
         ([1, 1, 1], None),
@@ -74,10 +77,11 @@ def test_sixteen_of_twenty_are_enough() -> None:
 
 
 def test_rare_failures_do_not_make_a_long_run_late() -> None:
-    # Nine of ten succeed, but near the end four fail in a row: 15 of 20 are no loss.
+    # Nine of ten episodes succeed, but near the end four fail in a row. A window with 15 successes
+    # of 20 does not end the steady state.
     success = np.arange(1000) % 10 > 0
     success[:300], success[980:984] = False, False
-    # Four of twenty may fail: here 298, 299, 300 and 310.
+    # Four of the first twenty episodes may fail: here 298, 299, 300 and 310.
     assert measures.steady(success) == 298
 
 
@@ -87,7 +91,8 @@ def test_steady_is_a_good_window_with_a_good_rest(success: list[bool]) -> None:
     def good(start: int) -> bool:
         windows = [sum(success[i : i + 5]) for i in range(start, len(success) - 4)]
         rest = success[start:]
-        # Of five and of all that follow 0.8, of every later five 0.5: three of them.
+        # The first five episodes need a success of 0.8, and so do all episodes to the end. Every
+        # later window needs a success of 0.5, which is three of five episodes.
         kept = bool(windows) and windows[0] >= 4 and min(windows) >= 3
         return kept and 5 * sum(rest) >= 4 * len(rest)
 
@@ -96,13 +101,14 @@ def test_steady_is_a_good_window_with_a_good_rest(success: list[bool]) -> None:
 
 
 def test_steady_places_count_from_the_beginning_of_the_run() -> None:
-    # Ten episodes on another stage, five that fail, then 25 that succeed.
+    # Ten episodes succeed on another stage. On the last stage five fail, and then 25 succeed.
     stage = np.array(["paper1"] * 10 + [LAST] * 30)
     slow = log([True] * 10 + [False] * 5 + [True] * 25, every=50, stage=stage)
     never = log([False] * 40)
     data = reproduction({"curriculum": [slow, slow, never]})
     find = {"success": measures.first_reached}
-    # The window from the second failure on has four, and 16 of 20 are enough: episode 12.
+    # The window that starts with the second failure, episode 12, holds four failures. 16 successes
+    # of 20 are enough.
     everything = measures.steady_at(data, "curriculum", axis="episode", stage=None, **find)
     np.testing.assert_array_equal(everything, [12, 12, math.inf])
     on_last = measures.steady_at(data, "curriculum", axis="steps", stage=LAST, **find)
@@ -122,15 +128,16 @@ def test_crowding_compares_the_last_to_arrive_with_the_first() -> None:
     steps = np.tile([300, 100, 500], (22, 1))
     sensed = np.tile([7, 2, 12], (22, 1))
     reached = np.ones((22, 3), bool)
-    reached[2, 2] = False  # here the first robot is the last to arrive: 7 - 2
-    reached[3, 1:] = False  # and here one alone arrives
-    sensed[:2] = 1000  # before the last twenty
+    reached[2, 2] = False  # Here robot 0 arrives last: 7 - 2.
+    reached[3, 1:] = False  # Here only robot 0 arrives.
+    sensed[:2] = 1000  # These come before the last twenty episodes.
     present = np.ones((22, 3), bool)
     one = log([True] * 22, robot_steps=steps, sensed=sensed, reached=reached, present=present)
     nothing = log([False] * 22)
     data = reproduction({"curriculum": [one, one, nothing]})
     found = measures.crowding(data, "curriculum", stage=LAST)
-    # 18 episodes of 12 - 2, and one of 7 - 2; their mean is exact but for its last digit.
+    # The difference is 12 - 2 in 18 episodes and 7 - 2 in one. The mean is exact except for its
+    # last digit.
     np.testing.assert_allclose(found, [(18 * 10 + 5) / 19] * 2 + [np.nan], rtol=1e-15)
 
 
@@ -143,10 +150,11 @@ def test_a_reward_near_the_best_is_searched_for_among_the_rivals() -> None:
     poor = log([True] * 40, reward=rewarded(0.5, 0.85))
     data = reproduction({"curriculum": [best] * 3, "baseline": [good, good, poor]})
     find = {"of": measures.mean_reward, "rivals": ("curriculum", "baseline"), "stage": LAST}
-    # Rolling means of the best: k / 20 after 20 + k episodes; 0.9 at 38.
+    # The rolling mean of `best` is k / 20 after 20 + k episodes, so it is 0.9 at episode 38.
     found = measures.reward_reached(data, "curriculum", axis="episode", **find)
     np.testing.assert_array_equal(found, [38] * 3)
-    # Above 0.9 from the first window on, which ends with episode 20; 0.85 is too little.
+    # `good` is above 0.9 from its first window on, which ends with episode 20. The 0.85 of `poor`
+    # is too low.
     found = measures.reward_reached(data, "baseline", axis="steps", **find)
     np.testing.assert_array_equal(found, [1000, 1000, math.inf])
 
@@ -160,7 +168,7 @@ def test_curves_are_taken_where_all_of_them_are() -> None:
     assert found is not None
     grid, values = found
     np.testing.assert_array_equal(grid, [2, 3, 4])
-    # Each holds until its next value.
+    # Each curve keeps its value until its next point.
     np.testing.assert_array_equal(values, [[20.0, 20.0, 40.0], [1.0, 2.0, 2.0]])
     assert measures.on_grid([*curves, (np.zeros(0), np.zeros(0))], points=9) is None
     assert measures.on_grid([*curves, (np.array([5]), np.array([1.0]))], points=9) is None

@@ -1,4 +1,4 @@
-"""The report of a reproduction: read as a browser would, it says what the data say."""
+"""Tests that the report of a reproduction, parsed as HTML, states the numbers of its data."""
 
 import json
 import re
@@ -19,7 +19,7 @@ HOSTILE = "</style><script>alert(1)</script>"
 
 
 class Page(HTMLParser):
-    """Tags with their attributes, rows of tables, and all other text."""
+    """Parses a page into tags with attributes, rows of tables, and the whole text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -46,13 +46,16 @@ class Page(HTMLParser):
             self.rows[-1][-1] += data.strip()
 
     def starting(self, *cells: str) -> list[list[str]]:
-        """Rows that begin with these cells."""
+        """Returns the rows that begin with these cells."""
         return [found for found in self.rows if found[: len(cells)] == list(cells)]
 
 
 @pytest.fixture(scope="module")
 def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
-    """The curriculum and the baseline have finished; success by seed is 0.5, 0.75 and 1."""
+    """Writes a reproduction in which only curriculum and baseline have finished.
+
+    The three seeds reach a share of 0.5, 0.75 and 1 of their targets.
+    """
     out = tmp_path_factory.mktemp("out")
     whole(out, arms=PAIR)
     judged = [
@@ -83,7 +86,8 @@ def test_the_header_says_how_the_data_came_about(partial: tuple[Path, Page]) -> 
 def test_the_table_that_the_paper_lacks(partial: tuple[Path, Page]) -> None:
     _, page = partial
     [found] = page.starting("baseline", LAST)
-    # The mean of three, of which none is trimmed, and a seed thrice in one resample of 27.
+    # The interquartile mean of three values trims none. The interval goes from the lowest to the
+    # highest value, since one of 27 resamples holds the lowest three times, and one the highest.
     assert found[2] == "75.0 % (50.0 to 100.0)"
     assert found[3:] == [
         "60.0 % (60.0 to 60.0)",
@@ -96,15 +100,16 @@ def test_the_table_that_the_paper_lacks(partial: tuple[Path, Page]) -> None:
 def test_where_success_becomes_steady(partial: tuple[Path, Page]) -> None:
     _, page = partial
     goal = "robot 1 reached its target"
-    # Ten failures, of which a window of 20 may have four: episode 7. On the last stage five are
-    # left, and the second of them is episode 7 of the run, which ends at 700 arena steps.
+    # The first ten episodes fail, and a window of 20 may hold four failures, so success is steady
+    # from episode 7 on. On the last stage only five episodes fail. The second of these failures is
+    # episode 7 of the run, which ends at 700 arena steps.
     everything, on_last = (
         page.starting(goal, "all episodes, episode number", "curriculum")[0],
         (page.starting(goal, f"episodes on {LAST}, arena steps", "curriculum")[0]),
     )
     assert everything[3:] == ["7", "7 (7 to 7)", "3 of 3"]
     assert on_last[3:] == ["700", "700 (700 to 700)", "3 of 3"]
-    # The baseline fails twice more, and is steady two episodes later in every seed.
+    # The baseline fails in two more episodes, so it is steady two episodes later in every seed.
     minus = "\N{MINUS SIGN}"
     assert page.starting(goal, "all episodes, episode number", f"{minus}2 ({minus}2 to {minus}2)")
     [found] = page.starting(
@@ -155,7 +160,7 @@ def test_the_page_needs_nothing_else(partial: tuple[Path, Page]) -> None:
 def test_a_single_arm_is_reported(tmp_path: Path) -> None:
     logs = {"baseline": [episode(n, seed=seed) for seed in SEEDS for n in range(1, 4)]}
     page = Page(reproduce_page.write(write(tmp_path, logs)).read_text())
-    # Three episodes are fewer than a window: there is no curve, and nothing is steady.
+    # Three episodes are fewer than a window, so there is no curve and no steady success.
     [found] = page.starting(
         "robot 1 reached its target", "all episodes, episode number", "baseline"
     )[:1]
@@ -177,7 +182,7 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ten_seeds_of_six_arms_stay_below_two_megabytes(tmp_path: Path) -> None:
-    # Noise in all that is drawn: nothing that compression could make use of.
+    # All plotted numbers are random, so that compression gains nothing.
     random = np.random.default_rng(0)
     logs = {
         arm: [

@@ -1,4 +1,4 @@
-"""`python -m swarmjax.reproduce` from end to end, and every way to be refused; few steps of all."""
+"""Tests `python -m swarmjax.reproduce` from end to end with few steps, and all its refusals."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ from swarmjax.reproduce import page as reproduce_page
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 
-# Eight updates of 64 control steps; the world is the paper's.
+# Eight updates of 64 control steps each, in the paper's world.
 TINY = [
     "arms=[baseline]",
     "seeds=3",
@@ -32,7 +32,7 @@ TINY = [
 
 @pytest.fixture
 def pages(monkeypatch: pytest.MonkeyPatch) -> list[reproduce_rows.Reproduction]:
-    """What the page, which has tests of its own, would have been made of."""
+    """Replaces the page, which has its own tests, and returns the reproductions it would show."""
     found: list[reproduce_rows.Reproduction] = []
 
     def write(out: Path) -> Path:
@@ -48,7 +48,7 @@ def test_what_was_stopped_goes_on_and_is_judged(
     tmp_path: Path, pages: list, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    # Time is up before the first arm begins.
+    # The time limit ends before the first arm begins.
     assert reproduce.main([*TINY, f"out={out}", "minutes=0.0001"]) == 0
     assert capsys.readouterr().out == (
         f"stopped with 1 of 1 arms to train, saved; go on with: python -m swarmjax.reproduce "
@@ -57,7 +57,8 @@ def test_what_was_stopped_goes_on_and_is_judged(
     assert not pages
     facts = json.loads((out / "reproduce.json").read_text())
     assert (facts["seeds"], facts["budget"], facts["seconds"]) == ([5, 6, 7], 512, {})
-    # A process that was killed before it had saved anything leaves no more than a config.
+    # A process that is killed before it saves anything leaves only a config. The run then resumes
+    # from the config.
     assert reproduce.main([f"resume={out}", "device=cpu"]) == 0
     (found,) = pages
     assert (found.seeds, list(found.logs)) == ((5, 6, 7), ["baseline"])
@@ -66,14 +67,14 @@ def test_what_was_stopped_goes_on_and_is_judged(
     for log, seed in zip(found.logs["baseline"], found.seeds, strict=True):
         mine = [row for row in metrics if row["seed"] == seed]
         assert len(mine) == 8
-        assert len(log) == sum(row["episodes"] for row in mine) >= 16  # of 32 steps at most
+        assert len(log) == sum(row["episodes"] for row in mine) >= 16  # up to 32 steps per episode
         assert log.sensed.sum() == sum(row["sensed"] for row in mine)
     rows = json.loads((out / "evaluation.json").read_text())["rows"]
     named = [(row["arm"], row["seed"], row["stage"], row["episodes"]) for row in rows]
     stages = ("paper6", "paper_expanded")
     assert named == [("baseline", seed, stage, 2) for seed in (5, 6, 7) for stage in stages]
     assert all(row["steps"] <= 32 for row in rows)
-    # All is there: nothing is trained or judged again.
+    # Everything is finished, so nothing is trained or judged again.
     before = {path: path.stat().st_mtime_ns for path in (out / "baseline").rglob("*")}
     assert reproduce.main([f"resume={out}"]) == 0
     assert {path: path.stat().st_mtime_ns for path in (out / "baseline").rglob("*")} == before
@@ -103,7 +104,7 @@ def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
 def test_a_device_that_is_not_there_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # This process has begun to compute on the CPU; JAX cannot change its mind.
+    # JAX already computes on the CPU in this process and cannot change its platform.
     monkeypatch.setattr(reproduce.jax.config, "update", lambda *_: None)
     assert refusal(reproduce.main, [f"out={tmp_path / 'new'}", "device=gpu"]) == (
         "device is gpu, but JAX finds no GPU here: give auto or cpu."
@@ -117,10 +118,10 @@ def test_a_device_that_is_not_there_is_refused(
         (["seeds=2"], "seeds is 2, too few for an interval: give 3 or more."),
         (["budget=5999"],
          "budget is 5999, which ends before the first update: give at least 6000, the control "
-         "steps of one."),
+         "steps of one update."),
         (["fine_tune=1"],
          "fine_tune is 1, which ends before the first update: give at least 6000, the control "
-         "steps of one."),
+         "steps of one update."),
         (["arms=[]"],
          "arms is []: give some of curriculum, baseline, curriculum_expanded, baseline_expanded, "
          "modern_curriculum, modern_baseline."),

@@ -1,4 +1,4 @@
-"""What a reproduction wrote down: laid out by seed, episode and robot, or refused in a sentence."""
+"""Tests reading a reproduction into arrays by seed, episode and robot, and its refusals."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ PAIR = ("curriculum", "baseline")
 
 
 def _three(*episodes: dict) -> list[dict]:
-    """The same episodes for each of three seeds."""
+    """Returns the same episodes for each of three seeds."""
     return [each | {"seed": seed} for seed in SEEDS for each in episodes]
 
 
@@ -35,7 +35,7 @@ def test_episodes_are_laid_out_by_robot(tmp_path: Path) -> None:
     assert data.seeds == SEEDS
     assert len(data.logs["curriculum"]) == 3
     log = data.logs["curriculum"][1]
-    # A robot that is absent reaches nothing and collects nothing.
+    # An absent robot reaches no target and collects no reward.
     np.testing.assert_array_equal(log.present, [[True, True, False], [True, True, True]])
     np.testing.assert_array_equal(log.reached, [[True, False, False], [True, True, False]])
     np.testing.assert_array_equal(log.reward, [[0.25, -0.5, 0.0], [1.0, 0.5, 0.125]])
@@ -94,7 +94,7 @@ def _append(out: Path, **given: object) -> None:
 
 
 def _drop(out: Path, text: str) -> None:
-    """Takes lines out of the baseline's log."""
+    """Removes the lines that contain `text` from the baseline's log."""
     path = out / "baseline" / "episodes.jsonl"
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("".join(line for line in lines if text not in line))

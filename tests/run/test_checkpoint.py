@@ -1,4 +1,4 @@
-"""Checkpoints: exact, checked, and forgiving of the newest one being damaged."""
+"""Checks that checkpoints are exact and verified, and that damaged ones are skipped."""
 
 import gc
 import json
@@ -18,14 +18,14 @@ from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints
 from swarmjax.run.errors import TrainingError
 
-# Where a restore fails, Orbax leaves an event loop that complains when it is collected.
+# After a failed restore, Orbax leaves an event loop that warns when it is garbage-collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 @pytest.fixture(autouse=True)
 def _collected() -> Iterator[None]:
     yield
-    gc.collect()  # here, and not in some other test
+    gc.collect()  # so that the warning comes in this test
 
 
 def _state(value: float) -> dict:
@@ -126,7 +126,7 @@ def test_a_seed_is_taken_out_of_a_run() -> None:
 
 @pytest.mark.parametrize("sound", [0, 1])
 def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
-    """Orbax saves nothing before its newest step, and never the same one again."""
+    """Orbax by itself refuses to save a step before its newest step, or a step twice."""
     _save(tmp_path, sound, 5)
     _flip_one_bit(tmp_path / "checkpoints" / "5")
     with Checkpoints(tmp_path, keep=3, update=sound) as checkpoints:
@@ -136,7 +136,7 @@ def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
     assert checkpoint.restore(tmp_path, 3)[0]["weights"][0, 0] == 3.0
 
 
-# What a checkpoint is of
+# The run and the update that a checkpoint belongs to
 
 
 def _bind(run: Path, name: str, epochs: int = 1) -> None:
@@ -188,7 +188,7 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
 
 
 def _forge(run: Path, changed: Callable[[dict], dict]) -> None:
-    """Changes what the first checkpoint says of itself, and drops the digests of its files."""
+    """Changes the metadata of the first checkpoint, and deletes the digests of its files."""
     (_steps(run) / "1" / "files.json").unlink(missing_ok=True)
     meta = _steps(run) / "1" / "meta" / "metadata"
     meta.write_text(json.dumps(changed(json.loads(meta.read_text()))))
@@ -232,11 +232,11 @@ def test_a_state_is_copied_before_the_run_goes_on(tmp_path: Path) -> None:
     state = {"weights": np.zeros((1000, 1000))}
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(state, 1)
-        state["weights"][:] = 1.0  # as the next call of the program does with a donated state
+        state["weights"][:] = 1.0  # as the next call does to a donated state
     assert not checkpoint.restore(tmp_path)[0]["weights"].any()
 
 
-# Saves where no file may have more than 2,000 bytes, as on a disk that is full.
+# A program that saves while files are limited to 2,000 bytes, as on a full disk.
 _FULL = """
 import resource, sys
 from pathlib import Path
@@ -264,7 +264,7 @@ def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-# Looks for the newest sound checkpoint.
+# A program that looks for the newest sound checkpoint.
 _FIND = """
 import sys
 from pathlib import Path
@@ -280,7 +280,7 @@ except checkpoint.CheckpointError as error:
 def test_orbax_says_nothing_beside_our_sentence(tmp_path: Path, damaged: list[int]) -> None:
     _save(tmp_path, 1, 2)
     for update in damaged:
-        (_steps(tmp_path) / f"{update}" / "files.json").unlink(missing_ok=True)  # as before them
+        (_steps(tmp_path) / f"{update}" / "files.json").unlink(missing_ok=True)  # as in old runs
         for file in (_steps(tmp_path) / f"{update}" / "state" / "d").iterdir():
             file.write_bytes(b"")
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Arrays that changed on the disk and that Orbax restores all the same are not trained on."""
+"""Checks that arrays which changed on the disk are refused, although Orbax restores them."""
 
 import shutil
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from swarmjax.run.checkpoint import CheckpointError, Checkpoints
 
 Damage = Callable[[Path], None]
 
-# Random bits, which no compression makes shorter: they lie in the file as they are.
+# Random bits cannot be compressed, so the file holds them unchanged.
 WEIGHTS = np.random.default_rng(0).integers(0, 2**32, 1024, np.uint32)
 FLIPPED = WEIGHTS ^ np.where(np.arange(1024) == 512, np.uint32(1), np.uint32(0))  # one bit
 
@@ -29,7 +29,7 @@ def _step(run: Path, update: int) -> Path:
 
 
 def _flip_in_the_file(run: Path) -> None:
-    """Flips a bit of the weights of update 2 where they lie."""
+    """Flips a bit of the weights of update 2 in their file."""
     before, after = WEIGHTS[500:524].tobytes(), FLIPPED[500:524].tobytes()
     files = [path for path in _step(run, 2).rglob("*") if path.is_file()]
     (file,) = [path for path in files if before in path.read_bytes()]
@@ -37,7 +37,7 @@ def _flip_in_the_file(run: Path) -> None:
 
 
 def _put_others_in_their_place(run: Path) -> None:
-    """Has Orbax itself write other weights for update 2, and leaves what was noted of the first."""
+    """Lets Orbax write other weights for update 2, and keeps the metadata of the first weights."""
     other = run.parent / "other"
     _save(other, FLIPPED, 2)
     shutil.rmtree(_step(run, 2) / "state")
@@ -46,9 +46,10 @@ def _put_others_in_their_place(run: Path) -> None:
 
 @pytest.fixture(params=[_flip_in_the_file, _put_others_in_their_place])
 def damaged(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
-    """A run with a sound checkpoint of update 1, and one of update 2 that has another bit.
+    """Returns a run with a sound checkpoint of update 1, and one of update 2 with a flipped bit.
 
-    It does not list its files, as older ones do not: the digest of the arrays has to notice.
+    Like older checkpoints, the damaged one has no list of files. Only the digest of the arrays can
+    reveal the damage.
     """
     run = tmp_path / "run"
     damage: Damage = request.param
@@ -65,7 +66,10 @@ def _as_orbax_restores(run: Path, update: int) -> np.ndarray:
 
 
 def test_orbax_does_not_notice_a_bit_that_changed_in_the_arrays(damaged: Path) -> None:
-    """Why there is a digest; if this fails, the others here no longer show that it is checked."""
+    """Shows why checkpoints need a digest.
+
+    If Orbax refused these arrays, the other tests here would no longer test the digest.
+    """
     np.testing.assert_array_equal(_as_orbax_restores(damaged, 2), FLIPPED)
 
 

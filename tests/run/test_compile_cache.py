@@ -1,4 +1,4 @@
-"""Compiled programs are kept, wherever that is possible, and never in the way."""
+"""Checks that compiled programs are cached where possible, and that no cache stops a run."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ _NAMES = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *compile_
 
 @pytest.fixture
 def unset() -> Iterator[None]:
-    """JAX as it is where nobody has set its cache up."""
+    """Puts JAX into the state in which no cache is set up, and restores it afterwards."""
     before = {name: getattr(jax.config, name) for name in _NAMES}
     jax.config.update("jax_compilation_cache_dir", None)
     jax.config.update("jax_enable_compilation_cache", True)
@@ -33,7 +33,7 @@ def unset() -> Iterator[None]:
 
 @pytest.fixture
 def events() -> Iterator[list[str]]:
-    """What JAX reports of its cache: `cache_hits` and `cache_misses`, among others."""
+    """Returns a list to which JAX's cache events are added, such as `cache_hits`."""
     found: list[str] = []
 
     def listen(event: str, **_: object) -> None:
@@ -58,7 +58,7 @@ def _entries(directory: Path) -> dict[str, bytes]:
 
 
 def _use(directory: Path | str | None) -> list[str]:
-    """Compiles and runs the program with a cache, and returns what was said."""
+    """Compiles and runs the program with a cache, and returns the messages of the cache."""
     said: list[str] = []
     with compile_cache.use(None if directory is None else str(directory), said.append):
         assert _compile_and_run() == 7.0
@@ -207,7 +207,7 @@ def test_a_large_cache_loses_what_was_used_longest_ago(
     for age, name in enumerate((new, middle, old, "package-cache")):
         (tmp_path / name).write_bytes(bytes(100))
         os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
-    os.utime(tmp_path / old, (1e9 + 1, 0.0))  # read later than all others
+    os.utime(tmp_path / old, (1e9 + 1, 0.0))  # read later than the other entries
     monkeypatch.setattr(compile_cache, "LARGEST", 250)
     compile_cache._shorten(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {new, old, "package-cache"}

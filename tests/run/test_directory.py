@@ -1,4 +1,4 @@
-"""A run directory: one process at a time, and logs whose truth is what a checkpoint counts."""
+"""Checks run directories: one process at a time, and logs cut to what a checkpoint counts."""
 
 import errno
 import fcntl
@@ -19,7 +19,7 @@ from swarmjax.run.directory import Log
 from swarmjax.run.errors import CheckpointError
 from swarmjax.run.settings import load_train
 
-# Holds the lock of a directory until it is killed.
+# A program that holds the lock of a directory until it is killed.
 _HOLDER = """
 import pathlib, sys, time
 from swarmjax.run import directory, lifecycle
@@ -109,7 +109,7 @@ def test_a_full_disk_is_an_error_and_nothing_waits(tmp_path: Path) -> None:
 
 @contextmanager
 def _room_for_10_bytes() -> Iterator[None]:
-    """Lets no file of this process grow beyond ten bytes, as a disk that is nearly full."""
+    """Limits files that this process writes to ten bytes, as on a disk that is nearly full."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
     try:
@@ -181,7 +181,7 @@ def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(
     lock, path, removed = directory._lock, tmp_path / directory.LOCK, []
 
     def remove_first(run: Path, file: Any) -> None:
-        if not removed:  # as the process does that held it and wrote nothing
+        if not removed:  # like a process that held the lock and wrote nothing
             removed.append(path.unlink())
         lock(run, file)
 

@@ -1,4 +1,4 @@
-"""What a run shows."""
+"""Checks what a run shows while it trains."""
 
 import io
 import sys
@@ -62,11 +62,11 @@ def test_a_summary_is_over_the_newest_stage_only() -> None:
 
 
 def test_seeds_are_summed_up_each_by_itself() -> None:
-    again = ROW | {"targets": 16, "reached": 12}  # as many again: 15 of 20 is 3 of 4
+    again = ROW | {"targets": 16, "reached": 12}  # together with ROW: 15 of 20, which is 3 of 4
     summary = summarize([ROW, OTHER, again], NAMES)
     assert summary["stage"] == "s2 to s3"
     assert summary["ended_targets"] == ((3 / 4 + 1 / 4) / 2, 1 / 4, 3 / 4)
-    assert summary["cohort_targets"] == (0.25, 0.25, 0.25)  # the other has none yet
+    assert summary["cohort_targets"] == (0.25, 0.25, 0.25)  # the other seed has none yet
     assert summary["episodes"] == 6
 
 
@@ -89,7 +89,10 @@ def _shown(terminal: bool, rows: list, names: list[str]) -> str:
 
 
 def _line_of(shown: str, name: str) -> str:
-    """The line that begins with a name; it is there twice, as a table is shown again at its end."""
+    """Returns the line that begins with a name.
+
+    The line is there twice, since the table is shown once more when the display closes.
+    """
     [line] = {line for line in shown.splitlines() if line.startswith(name)}
     return line
 
@@ -121,7 +124,7 @@ def test_several_seeds_are_shown_with_their_range() -> None:
     assert "50.0 % (25 to 75)" in _line_of(shown, "│ - in episodes just ended")
     assert "90.0 % (85 to 95)" in _line_of(shown, " s1 ")
     assert "stage s2 to s3" in shown
-    # 0.9 is the mean of 0.95 and 0.85, but for rounding: not above.
+    # The mean of 0.95 and 0.85 is 0.9, up to rounding, and 0.9 is not above 90 %.
     assert "0 of 3 stages above 90 %" in shown
 
 
@@ -178,15 +181,15 @@ def test_a_single_stage_has_no_table_of_stages() -> None:
 
 
 class _Gone(io.StringIO):
-    """A terminal that was closed, or a pipe without a reader."""
+    """An output that cannot be written, such as a closed terminal or a pipe without a reader."""
 
     def __init__(self, error: type[OSError]) -> None:
-        """Fails with this error."""
+        """Sets the error that each write raises."""
         super().__init__()
         self._error = error
 
     def write(self, _: str) -> int:
-        """Fails."""
+        """Raises the error."""
         raise self._error
 
 

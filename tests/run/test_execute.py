@@ -1,4 +1,4 @@
-"""What a run says at its end."""
+"""Checks the sentence that a run prints at its end."""
 
 import pytest
 
@@ -42,4 +42,4 @@ def test_a_last_stage_that_was_not_measured_is_named() -> None:
 def test_a_run_that_measured_nothing_says_what_is_missing() -> None:
     said = execute._success(SETTINGS, _tally({}))
     assert said.startswith("targets reached: not measured yet, since no whole cohort ended")
-    assert "(16 updates)" in said  # 500 control steps in rollouts of 32
+    assert "(16 updates)" in said  # 500 control steps fill 16 rollouts of 32

@@ -1,4 +1,4 @@
-"""A grid of settings multiplied out."""
+"""Checks that a grid of settings gives a cell for each combination of values."""
 
 import json
 from pathlib import Path

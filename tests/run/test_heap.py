@@ -1,4 +1,4 @@
-"""Threads share a heap, and free memory goes back to the operating system."""
+"""Checks that threads share a heap, and that freed memory returns to the operating system."""
 
 import os
 import platform
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.skipif(
     platform.libc_ver()[0] != "glibc", reason="other C libraries are not told anything"
 )
 
-# Has glibc write down its heaps after eight threads have allocated.
+# A program that makes glibc print its heaps after eight threads have allocated memory.
 _THREADS = """
 import ctypes, sys, threading
 from swarmjax.run import heap
@@ -45,7 +45,8 @@ def test_two_cores_share_a_heap() -> None:
     assert _heaps(0) > 3  # not limited
 
 
-# Every hundredth block stays, so that none of the pages between lies at the end of the heap.
+# A program that frees blocks. It keeps every hundredth block, so that the free pages do not lie at
+# the end of the heap.
 _BLOCKS = """
 import psutil
 from swarmjax.run import heap
@@ -62,5 +63,6 @@ def test_freed_memory_is_given_back() -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     words = [sys.executable, "-c", _BLOCKS]
     done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
-    # Of 100 MB, all but the pages of 4 KiB in which one of the 1,000 lies.
+    # The blocks fill 100 MB. All of this memory is released, except the 4 KiB pages that hold the
+    # 1,000 kept blocks.
     assert int(done.stdout) > 80e6

@@ -1,4 +1,4 @@
-"""Several processes train one run: who refuses, who writes, and what becomes of a lost one."""
+"""Checks runs of several processes: refusals, written files, and the loss of a process."""
 
 import json
 import os
@@ -40,7 +40,7 @@ def _start(run: Path, coordinator: str, process: int, *words: str) -> subprocess
 
 @pytest.fixture
 def coordinator() -> str:
-    """An address that is free."""
+    """Returns an address with a free port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"127.0.0.1:{free.getsockname()[1]}"
@@ -89,13 +89,13 @@ def test_a_death_is_a_sentence(joined: bool, code: int, capsys: pytest.CaptureFi
 def test_a_process_whose_peer_never_comes_is_refused_in_time(
     tmp_path: Path, coordinator: str
 ) -> None:
-    for process in (0, 1):  # the coordinator waits for the other, and the other for it
+    for process in (0, 1):  # process 0, the coordinator, waits for process 1, and 1 for 0
         began = time.monotonic()
         code, said = _said(_start(tmp_path / "run", coordinator, process, "devices=2"))
         assert code == 2
-        assert "did not meet within" in said
+        assert "did not connect within" in said
         assert "Traceback" not in said
-        # 45 s of waiting, and the start of a process on a busy machine.
+        # 90 s: 45 s of waiting, and the start of a process on a busy machine.
         assert time.monotonic() - began < 90.0
 
 

@@ -1,4 +1,4 @@
-"""What loggers are told: the figures of `metrics.jsonl`, whatever becomes of the loggers."""
+"""Checks that loggers get the rows of `metrics.jsonl`, and that a failed logger stops no run."""
 
 import contextlib
 import importlib.util
@@ -35,7 +35,7 @@ HAS_WANDB = getattr(importlib.util.find_spec("wandb"), "origin", None) is not No
 
 
 class Listening:
-    """A logger that keeps what it is told, and in which thread."""
+    """A logger that records each of its calls and the thread of the call."""
 
     name = "Listening"
 
@@ -56,7 +56,7 @@ class Listening:
 
 
 class Told:
-    """A run with every logger, and what each was told."""
+    """A run with every kind of logger, and the calls that they got."""
 
     def __init__(self, run: Path) -> None:
         self.called: list[dict] = []
@@ -88,7 +88,10 @@ def _numbers(row: dict) -> dict[str, float]:
 
 
 def _events(file: Path) -> Iterator[Any]:
-    """Reads a file of TFRecords: a length, its checksum, the bytes and their checksum, each."""
+    """Reads a file of TFRecords.
+
+    Each record is a length, a checksum of the length, the bytes, and a checksum of the bytes.
+    """
     content, at, made = file.read_bytes(), 0, event_pb2
     while at < len(content):
         (length,) = struct.unpack_from("<Q", content, at)
@@ -97,7 +100,7 @@ def _events(file: Path) -> Iterator[Any]:
 
 
 def _scalars(folder: Path) -> list[tuple[int, dict[str, float]]]:
-    """The numbers of each event of a folder of TensorBoard, by its step."""
+    """Returns the step and the numbers of each event in a TensorBoard folder."""
     (file,) = folder.iterdir()
     return [
         (event.step, {each.tag: each.simple_value for each in event.summary.value})
@@ -114,7 +117,7 @@ def test_a_function_is_told_the_rows_of_the_record(told: Told) -> None:
 def test_tensorboard_has_the_numbers_of_the_record(told: Told) -> None:
     found = [each for each in _scalars(told.run / "tensorboard") if "update" in each[1]]
     expected = [
-        # TensorBoard keeps numbers of 32 bits.
+        # TensorBoard stores numbers as float32.
         (row["arena_steps"], {k: float(np.float32(v)) for k, v in _numbers(row).items()})
         for row in told.rows
     ]
@@ -150,7 +153,7 @@ def test_wandb_offline_has_the_numbers_of_the_record(told: Told) -> None:
 
 
 def _histories(file: Path) -> Iterator[dict]:
-    """Reads the rows of an offline run of W&B: a log of LevelDB with a header of 7 bytes."""
+    """Reads the rows of an offline W&B run, which is a LevelDB log after a header of 7 bytes."""
     from wandb.proto import wandb_internal_pb2 as made  # pyright: ignore[reportMissingImports]
 
     content, at, part, block = file.read_bytes(), 7, b"", 2**15
@@ -161,7 +164,7 @@ def _histories(file: Path) -> Iterator[dict]:
         length, kind = struct.unpack_from("<HB", content, at + 4)
         part += content[at + 7 : at + 7 + length]
         at += 7 + length
-        if kind in (1, 4):  # whole, or the last of several
+        if kind in (1, 4):  # a whole record, or the last part of one
             record, part = made.Record.FromString(part), b""
             if record.WhichOneof("record_type") == "history":
                 items = record.history.item
@@ -210,7 +213,7 @@ def test_a_logger_that_does_not_end_is_left_behind(
     guarded.write([{"update": 0}], {})
     guarded.close()
     for_ever.set()
-    assert "log is not written from here on: it has not taken" in capsys.readouterr().err
+    assert "log is not written from here on: it has not finished" in capsys.readouterr().err
 
 
 def test_tensorboard_takes_figures_and_the_places_of_pages(tmp_path: Path) -> None:
@@ -239,7 +242,7 @@ def test_what_is_no_logger_is_refused(given: Any) -> None:
 def test_wandb_that_is_missing_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: bool
 ) -> None:
-    # The folder that W&B writes would be a package without code.
+    # W&B writes a folder `wandb`, which Python takes for a package without code.
     spec = importlib.util.spec_from_loader("wandb", None) if folder else None
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
     words = [

@@ -1,4 +1,4 @@
-"""What a run needs of a device's memory, what fits, and how what does not is refused."""
+"""Checks how much device memory a run needs, how many arenas fit, and what is refused."""
 
 import re
 from collections.abc import Callable
@@ -31,10 +31,10 @@ def _linear(fixed: int, each: int) -> Callable[[TrainConfig], int]:
 def test_two_small_programs_tell_what_a_larger_one_takes(tiny_config: TrainConfig) -> None:
     fixed, each = memory.line(tiny_config, [16, 64], trainer.measure)
     found = trainer.measure(replace(tiny_config, arenas=512, budget=512 * 8))
-    # XLA lays its buffers out anew for each program: 1.0 % was seen.
+    # XLA lays out the buffers of each program differently. The measured error is 1.0 %.
     assert fixed + 512 * each == pytest.approx(found, rel=0.02)
-    # As much as each arena's part of the batch at least: 8 control steps of 3 robots, each with all
-    # that it observes, in float32.
+    # An arena needs at least the memory of its observations in the batch: 8 control steps of 3
+    # robots, in float32.
     assert each > 8 * 3 * SIZE * 4
 
 
@@ -42,7 +42,7 @@ def test_the_bytes_of_a_tree_are_those_of_its_arrays() -> None:
     tree = {"a": jnp.zeros((3, 5)), "b": jnp.zeros(7, jnp.int8)}
     assert seeds.size(tree) == 3 * 5 * 4 + 7
     assert seeds.size(jax.eval_shape(lambda: tree)) == 3 * 5 * 4 + 7
-    assert seeds.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # two words each
+    assert seeds.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # a key has two words
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone has it")
@@ -71,11 +71,12 @@ def test_a_buffer_of_levels_larger_than_the_memory_is_refused() -> None:
 @pytest.mark.parametrize(
     ("share", "minibatches", "arenas"),
     [
-        # 1e6 bytes and 1000 of each arena in 0.8 of 100e6: 79,000, rounded down.
+        # 0.8 of 100e6 bytes hold 1e6 bytes and 1000 bytes for each of 79,000 arenas, which are
+        # rounded down to 8 * 2^13.
         (0.8, 8, 65536),
-        (0.6, 8, 32768),  # 59,000
+        (0.6, 8, 32768),  # 59,000 fit
         (0.8, 6, 49152),  # 6 * 2^13
-        (0.01, 8, 8),  # not even the fixed part; what is too much is refused later
+        (0.01, 8, 8),  # not even the fixed part fits; a later check refuses it
     ],
 )
 def test_auto_fills_the_share_with_a_power_of_two(
@@ -94,7 +95,7 @@ def test_auto_fills_the_share_with_a_power_of_two(
 
 
 def test_auto_stops_where_the_rest_of_the_config_does() -> None:
-    # 1e6 control steps pay an update of 31,250 arenas.
+    # A budget of 1e6 control steps is enough for one update of 31,250 arenas.
     settings = replace(SETTINGS, budget=10**6)
     chosen, why = memory.fill(settings, _linear(0, 1000), 100 * GIB)
     assert chosen.arenas == 16384
@@ -112,7 +113,7 @@ def test_auto_measures_two_small_programs_whatever_the_budget() -> None:
     memory.fill(SETTINGS, measure, GIB)
     assert measured == [(2048, 1), (4096, 1)]
     measured.clear()
-    # 512 control steps pay for 16 arenas, and for no more.
+    # A budget of 512 control steps is enough for one update of 16 arenas, and not for more.
     assert memory.fill(replace(SETTINGS, arenas=8, budget=512), measure, GIB)[0].arenas == 16
     assert measured == [(8, 1), (16, 1)]
     measured.clear()
@@ -130,7 +131,8 @@ def test_auto_on_a_cpu_is_the_default(minibatches: int, arenas: int) -> None:
 
 @pytest.mark.parametrize(
     ("backend", "available", "arenas"),
-    # 1e6 bytes and 1000 of each arena in 0.8 of 100e6: 79,000, rounded down.
+    # 0.8 of 100e6 bytes hold 1e6 bytes and 1000 bytes for each of 79,000 arenas, which are rounded
+    # down to 8 * 2^13.
     [("cpu", 10**8, 128), ("gpu", 10**8, 65536), ("gpu", None, 128)],
 )
 def test_training_begins_with_the_choice(
@@ -177,7 +179,7 @@ def test_what_fits_is_not_refused() -> None:
 
 def test_a_run_too_large_is_refused_with_what_fits() -> None:
     settings = replace(SETTINGS, arenas=1000)
-    # 1000 * 0.95 * 3 / 4 = 712.5, of which 712 is a multiple of 8.
+    # 1000 * 0.95 * 3 / 4 = 712.5, rounded down to 712, a multiple of 8.
     with pytest.raises(ConfigError) as caught:
         memory.check(settings, 4 * GIB, 3 * GIB)
     assert str(caught.value) == (
@@ -207,7 +209,7 @@ def test_where_fewer_arenas_cannot_be_something_else_is_named() -> None:
     )
     with pytest.raises(ConfigError) as caught:
         memory.check(replace(SETTINGS, resume="runs/one"), 4 * GIB, 3 * GIB)
-    assert str(caught.value).endswith(": go on with it on a device that has more.")
+    assert str(caught.value).endswith(": continue the run on a device with more memory.")
 
 
 def test_a_device_that_is_full_is_one_sentence() -> None:

@@ -1,4 +1,4 @@
-"""What a command prints for the next step can be pasted, whatever kind of run it was."""
+"""Checks that the command printed for the next step can be pasted, for every kind of run."""
 
 import shlex
 from pathlib import Path
@@ -31,7 +31,7 @@ KINDS = {
 
 
 def _pasted(text: str, name: str) -> list[str]:
-    """The arguments of the command that a text ends with."""
+    """Returns the arguments of the command at the end of a text."""
     words = shlex.split(text.strip().splitlines()[-1].partition(": ")[2])
     assert words[:3] == ["python", "-m", f"swarmjax.{name}"]
     return words[3:]

@@ -1,4 +1,4 @@
-"""What a run writes down."""
+"""Checks the files that a run writes."""
 
 import errno
 import json
@@ -42,7 +42,7 @@ def test_rows_are_counts_with_their_shares() -> None:
     first, second = recorder.rows(METRICS, 2, ["s1", "s2"], [7], control_steps=100)
     assert first["seed"] == second["seed"] == 7
     assert first["stage"] == "s1"
-    assert first["arena_steps"] == 500  # updates 0..4 of 100
+    assert first["arena_steps"] == 500  # updates 0 to 4 of 100 control steps each
     assert first["targets_reached"] == 3 / 4
     assert first["all_reached"] == 1 / 2
     assert first["return"] == 2.0 / 4
@@ -64,7 +64,7 @@ def test_seeds_of_an_update_stand_together() -> None:
     assert [(row["update"], row["seed"]) for row in rows] == [(4, 7), (4, 8), (5, 7), (5, 8)]
     assert [row["targets_reached"] for row in rows] == [3 / 4, 4 / 4, None, None]
     assert [row["mix"] for row in rows] == [[8, 0], [0, 8], [6, 2], [2, 6]]
-    assert [row["arena_steps"] for row in rows] == [500, 500, 600, 600]  # of a seed
+    assert [row["arena_steps"] for row in rows] == [500, 500, 600, 600]  # of each seed
 
 
 def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_tensorboard_is_written_where_it_is_wanted(tmp_path: Path, wanted: bool)
 def test_a_run_goes_on_where_tensorboard_cannot_be_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As if it were not installed.
+    # Acts as if TensorBoard were not installed.
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     monkeypatch.setitem(sys.modules, "tensorboardX.event_file_writer", None)
     with Recorder(tmp_path, seeds=[0], tensorboard=True, update=0) as record:
@@ -127,7 +127,7 @@ def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path)
 def test_a_run_ends_though_the_disk_was_full_for_tensorboard(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """TensorBoardX's own writer has a thread that dies, and its full queue made this wait."""
+    """The thread of tensorboardX's own writer died, and the run waited for its full queue."""
 
     write, left = RecordWriter.write, [5]
 

@@ -1,4 +1,4 @@
-"""What a whole run survives: kills, signals, a full disk, and a second start."""
+"""Checks that a run survives kills, signals, a full disk, and a second start."""
 
 import json
 import os
@@ -42,7 +42,7 @@ _CODE = "import sys; from swarmjax import train; sys.exit(train.main(sys.argv[1:
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_once() -> Iterator[None]:
-    """Compiles each program once, as no test here is about compiling."""
+    """Compiles each program once, since no test here is about compiling."""
     compile_chunk, found = trainer.compile_chunk, {}
 
     def look_up(program: Any, *arguments: Any, **given: Any) -> trainer.Compiled:
@@ -104,16 +104,16 @@ def test_checkpoints_come_by_share_of_the_budget(tmp_path: Path) -> None:
     assert train.main([*words, "run.checkpoint_share=0.5", "run.checkpoint_minutes=99"]) == 0
     steps = checkpoint.steps(tmp_path)
     assert steps[0] == 9
-    assert 3 <= len(steps) <= 5  # each begun after at least half of 4.5 updates
+    assert 3 <= len(steps) <= 5  # each begins after 2.25 to 4.5 updates
 
 
 def _kill_while_opening(run: Path, torn: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Goes on with a run, and kills it while it opens one of its files.
+    """Resumes a run, and interrupts it while it opens one of its files.
 
     Args:
-      run: That goes on.
-      torn: Name of the file: of a text that is written in place, half is there.
-      monkeypatch: That is undone.
+      run: The run to resume.
+      torn: Name of the file. If the run writes this file in place, it writes only half of the text.
+      monkeypatch: Sets the interrupts; it is undone at the end.
     """
     replaced, written = Path.replace, Path.write_text
 
@@ -169,7 +169,7 @@ def test_a_resume_that_is_killed_while_it_opens_its_decisions_loses_none(
 
 def test_rows_after_the_checkpoint_are_not_doubled(whole: Path, tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
-    with (run / "metrics.jsonl").open("a") as file:  # of a call whose checkpoint never came
+    with (run / "metrics.jsonl").open("a") as file:  # of a call that saved no checkpoint
         file.write('{"update": 5, "seed": 0}\n{"update": 6, "se')
     assert train.main([f"resume={run}"]) == 0
     assert _updates(run) == list(range(9))
@@ -250,7 +250,7 @@ def test_a_signal_of_a_scheduler_saves_and_asks_for_a_requeue(
     began = time.monotonic()
     process.send_signal(signal.SIGUSR1)
     said, _ = process.communicate(timeout=120)
-    # A call of `all` takes about ten seconds; the rest is for a busy machine.
+    # With run.chunk=all, a call takes about ten seconds; the rest is for a busy machine.
     assert time.monotonic() - began < 60.0
     assert process.returncode == REQUEUE
     assert f"resume={tmp_path}" in said
@@ -284,7 +284,7 @@ def test_two_processes_do_not_write_one_run(tmp_path: Path) -> None:
 
 def test_two_new_runs_do_not_begin_in_one_directory(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with directory.locked(run):  # as by a run that still compiles, and has written nothing else
+    with directory.locked(run):  # like a run that still compiles and has written no other file
         assert os.listdir(run) == [LOCK]
         with pytest.raises(ConfigError, match=f"process {os.getpid()} is writing"):
             train.main([*TINY, f"run.dir={run}"])
@@ -292,7 +292,7 @@ def test_two_new_runs_do_not_begin_in_one_directory(tmp_path: Path) -> None:
 
 
 def _full(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
-    """Lets a disk be full after some rows."""
+    """Makes the disk appear full after this many writes to logs."""
     write, left = directory.Log.write, [after]
 
     def until_full(self: directory.Log, rows: Any) -> None:
@@ -323,7 +323,7 @@ def test_a_full_disk_is_one_sentence_and_the_run_goes_on_later(
     assert _digest(run) == _digest(whole)
 
 
-# To go on with what is there, or to begin
+# To resume a run, or to begin one
 
 
 def test_auto_begins_and_then_goes_on(whole: Path, tmp_path: Path) -> None:
@@ -412,7 +412,7 @@ def test_a_directory_that_is_removed_while_a_run_trains_is_one_sentence(
 
 def test_a_run_verifies(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert verify.main([f"run={whole}", "updates=9"]) == 0
-    assert f"{whole} is bit for bit what it was, to update 9" in capsys.readouterr().out
+    assert f"{whole} was reproduced bit for bit, up to update 9" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -458,7 +458,13 @@ def test_what_cannot_be_verified_is_one_sentence(
 
 
 def _spoil(monkeypatch: pytest.MonkeyPatch, at: int, times: int = 1) -> None:
-    """Breaks the optimiser's state of a run's last seed after some updates, so many times."""
+    """Sets the optimiser's state of a run's last seed to NaN.
+
+    Args:
+      monkeypatch: Makes the change.
+      at: Number of updates after which the state is broken.
+      times: Number of calls of the program that break it.
+    """
     call, left = trainer.compile_chunk, [times]
 
     def broken(x: jax.Array) -> jax.Array:
@@ -507,7 +513,7 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     assert train.main(words) == FAILED
     said = capsys.readouterr().err
     assert "no gradient step of seed 1 was finite in 10 updates" in said
-    assert "It had gone back once already: give lower algo.actor_learning_rate" in said
+    assert "The run had already gone back once: give lower algo.actor_learning_rate" in said
     assert checkpoint.restore(tmp_path)[1] == 4
 
 
@@ -521,11 +527,11 @@ def test_a_run_whose_arenas_all_break_stops_and_says_so(
     assert train.main(words) == FAILED
     said = capsys.readouterr().err
     assert "every arena broke at every step in 10 updates up to update 10" in said
-    assert "It had gone back once already" in said
+    assert "The run had already gone back once" in said
 
 
 def _spoilt(run: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> Path:
-    """A run that breaks at update 20 of 40 and is stopped."""
+    """Returns a run that breaks at update 20 of 40, and stops after `stop_after` updates."""
     _spoil(monkeypatch, at=20)
     words = [*TINY, "budget=640", "run.chunk=1", f"run.stop_after={stop_after}"]
     assert train.main([*words, f"run.dir={run}"]) == 0

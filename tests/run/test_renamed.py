@@ -1,4 +1,4 @@
-"""Keys that have a new name: refused with it when they are typed, read where they are stored."""
+"""Checks renamed keys: a typed old name is refused with its new name, and a stored one is read."""
 
 import pytest
 from sentences import refusal

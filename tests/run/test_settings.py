@@ -1,4 +1,4 @@
-"""Every default, every check and every sentence of the settings."""
+"""Checks every default, every check and every message of the settings."""
 
 import dataclasses
 import json
@@ -61,9 +61,10 @@ def test_train_defaults_to_the_whole_curriculum():
     train = load_train([])
     assert [stage.name for stage in train.stage] == ["s1", "s2", "s3", "s4", "s5", "s6"]
     assert train.stage_name == "curriculum"
-    # No file of configs/ sets what the sections already say.
+    # The files in configs/ change no default of the sections.
     assert train == TrainConfig(stage=train.stage, stage_name="curriculum")
-    # 3e6 // (128 * 32) = 3e6 // 4096 = 732, and 732 * 4096 = 2 998 272 is the last whole update.
+    # 3e6 // (128 * 32) = 3e6 // 4096 = 732 updates, and the last whole update ends at
+    # 732 * 4096 = 2,998,272 control steps.
     assert train.updates == 732
     assert train.learners == 1
 
@@ -134,7 +135,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
          "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, realism, "
          "extensions, run, resume, init_from, init_from_std."),
-        # What Hydra's grammar refuses.
+        # Words that Hydra's grammar refuses.
         (["algo.hidden_sizes=[64"], "'algo.hidden_sizes=[64' cannot be read: quote a value with "
          "special characters, as in \"algo.hidden_sizes='a=b'\"."),
         (["arenas=1,2"], "'arenas=1,2' gives several values, and a run takes one: write a list "
@@ -199,7 +200,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "[low,high] of numbers."),
         (["stage=s2", "stage.level=fixed", "stage.side=[1,2]"], "stage.side is [1,2], but level is "
          "fixed: give one number."),
-        # The smallest of the arenas must do; 0.77 as worked out below.
+        # The smallest arena of the range must have room; 0.77 is worked out below.
         (["stage=s6", "stage.side=[0.7,1.2]"], "stage.side is [0.7,1.2], too small for robots=5, "
          "obstacles=3, obstacle_size=0.1: give at least 0.77."),
         # Options of a mode.
@@ -237,8 +238,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "each stage once."),
         # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743.
         (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
-         "is [0.4,0.5], too small for every cell of the grid: the fewest robots and obstacles need "
-         "0.58."),
+         "is [0.4,0.5], too small for every cell of the grid: even the fewest robots and obstacles "
+         "need 0.58."),
         (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
         (["task.history=0"], "task.history is 0: give 1 to 64."),
         (["task.history=65"], "task.history is 65: give 1 to 64."),
@@ -265,13 +266,14 @@ def test_import_needs_neither_jax_nor_hydra():
          "to 2."),
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
         (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
-         "may be 2147483647: give at most 2147483646."),
+         "may be at most 2147483647: give at most 2147483646."),
         (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, map, cores or devices."),
         (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
          "4096 control steps: give at least 4096."),
-        # 1e15 // 4096 = 244140625000; 1 epoch of 8 minibatches: (2**31 - 1) // 8 = 268435455, and
-        # 268435455 * 4096 = 1099511623680.
+        # 1e15 // 4096 = 244140625000 updates. An update has 1 epoch of 8 minibatches, so 32 bits
+        # are enough for (2**31 - 1) // 8 = 268435455 updates. These take
+        # 268435455 * 4096 = 1099511623680 control steps.
         (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
          "control steps, but gradient steps are counted in 32 bits, which is enough for 268435455 "
          "updates: give at most 1099511623680."),
@@ -326,7 +328,7 @@ def test_export_refuses_an_unknown_format():
          "run."),
         (["policy=p", "format=c", "step=1"], "step is 1, but policy is one file: give step with "
          "run."),
-        (["policy=p"], "out is null, but policy is given already: give out=FILE."),
+        (["policy=p"], "out is null, but policy is already an npz file: give out=FILE."),
         (["run=r", "format=onnx", "sensors=real"], "sensors is real, but format is onnx: give "
          "format=webots."),
     ],
@@ -349,7 +351,7 @@ def test_a_training_without_stages_is_refused():
 def test_options_hold_their_defaults_in_their_own_mode():
     def options(*words):
         made = load_train([f"curriculum.{word}" for word in words])
-        # A stored configuration is the same again.
+        # A stored configuration is read back unchanged.
         assert build(TrainConfig, to_dict(made)) == made
         return made.curriculum
 
@@ -384,9 +386,10 @@ def test_grid():
     assert names[:6] == [
         "r2-o0-s50", "r2-o0-s70", "r2-o0-s100", "r2-o0-s120", "r2-o1-s50", "r2-o1-s70",
     ]  # fmt: skip
-    # Too small are 0.5 m: for 5 robots (0.58), for an obstacle with 3 or 5 robots (0.54 and more:
-    # 0.10 + sqrt(3 * 0.045 + 0.0583)), for two obstacles (0.64) and three (0.76) with any; and
-    # 0.7 m for three. 48 - 1 - 2 - 3 - 6 are left.
+    # A side of 0.5 m is too small for 5 robots (they need 0.58 m), for one obstacle with 3 or 5
+    # robots (0.54 m and more: 0.10 + sqrt(3 * 0.045 + 0.0583)), and for two obstacles (0.64 m) or
+    # three (0.76 m) with any number of robots. A side of 0.7 m is too small for three obstacles.
+    # 48 - 1 - 2 - 3 - 6 stages are left.
     assert len(names) == 36
     assert not {"r5-o0-s50", "r3-o1-s50", "r2-o2-s50", "r2-o3-s70"} & set(names)
     assert {"r3-o0-s50", "r2-o1-s50", "r5-o2-s70", "r2-o3-s100"} <= set(names)
@@ -398,8 +401,8 @@ def test_grid():
 def test_a_grid_of_ones_own():
     words = ["robots=[3]", "obstacles=[1,0]", "side=[0.755,[0.8,1.25]]", "obstacle_size=0.2"]
     train = load_train(["stage=grid", *(f"stage.grid.{word}" for word in words)])
-    # The order is that of the axes. A box of 0.2 m needs
-    # 0.10 + (0.2 sqrt(2) + 0.10) / sqrt(0.4) = 0.71.
+    # The stages follow the order of the axes. A box of 0.2 m needs a side of
+    # 0.10 + (0.2 sqrt(2) + 0.10) / sqrt(0.4) = 0.71 m.
     assert [(stage.name, stage.side) for stage in train.stage] == [
         ("r3-o1-s75_5", 0.755),
         ("r3-o1-s80-125", (0.8, 1.25)),
@@ -415,12 +418,12 @@ def test_a_grid_of_ones_own():
 def test_area_criterion_by_hand():
     # Two robots: (side - 0.10)^2 >= 2 * 2 * 0.0225 = 0.09 = 0.3^2, so side >= 0.4.
     stage = StageConfig(name="a", robots=2, side=0.5)
-    # Rounding of the square and its root, each 1e-16.
+    # The square and its root round by 1e-16 each.
     assert smallest_side(stage) == pytest.approx(0.4, abs=1e-12)
     # 5 robots, 3 obstacles: 10 * 0.0225 + 3 * (0.141421 + 0.1)^2 = 0.225 + 3 * 0.0582843
     # = 0.3998528, whose root is 0.6323392: side >= 0.7323392.
     stage = StageConfig(name="b", robots=5, side=1.0, obstacles=3, level="fixed")
-    # Seven digits were worked out above.
+    # The sum above has seven digits.
     assert smallest_side(stage) == pytest.approx(0.7323392, abs=1e-7)
     # Random boxes fill 0.4 of the square at most: 3 * 0.0582843 / 0.4 = 0.4371323, root 0.6611598.
     stage = StageConfig(name="c", robots=5, side=1.0, obstacles=3)
@@ -431,12 +434,12 @@ def test_area_criterion_by_hand():
 @given(st.integers(1, 5), st.integers(1, 4), st.floats(0.02, 0.3))
 def test_an_obstacle_leaves_a_passage_on_either_side(robots, obstacles, size):
     stage = StageConfig(name="c", robots=robots, side=4.0, obstacles=obstacles, obstacle_size=size)
-    # The area already asks for it: 0.10 + sqrt((d + 0.10)^2 + more) > d + 0.20, d the diagonal.
+    # The area implies the passages: 0.10 + sqrt((d + 0.10)^2 + more) > d + 0.20, with diagonal d.
     assert smallest_side(stage) > size * math.sqrt(2) + 2 * 0.10
 
 
 def test_too_small_an_arena_names_the_least_side():
-    # 0.10 + (0.1 sqrt(2) + 0.10) sqrt(3 / 0.4) = 0.761, more than 0.737 by the sum of all squares.
+    # 0.10 + (0.1 sqrt(2) + 0.10) sqrt(3 / 0.4) = 0.761, more than 0.732 by the sum of all squares.
     data = STAGE | {"robots": 5, "obstacles": 3, "side": 0.76}
     sentence = refusal(build, TrainConfig, {"stage": [data]})
     assert sentence == (
@@ -476,7 +479,7 @@ def test_resume_changes_budget_and_run_only():
 @pytest.mark.parametrize("key", GONE)
 def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key):
     assert refusal(load_train, [f"algo.{key}=0.5"]) == (
-        f"algo.{key} is no longer a key: give a fixed price in the reward instead."
+        f"algo.{key} is no longer a key: give a negative task.reward.robot_contact instead."
     )
 
 
@@ -498,7 +501,7 @@ def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
     assert load_resume(stored, []) == expected
     assert json.dumps(stored) == before
     assert from_stored(to_dict(expected)) == expected
-    # What never was a key is still refused, and so is what is no section.
+    # A key that never existed is still refused, and so is a section without keys.
     stored["algo"]["contact_prize"] = 0.5
     assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
     assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")

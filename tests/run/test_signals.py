@@ -1,4 +1,4 @@
-"""Signals: the first asks a run to save, the second ends it at once."""
+"""Checks that the first signal asks a run to save, and that the second ends it at once."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ import pytest
 from swarmjax.exit_codes import INTERRUPTED, REQUEUE
 from swarmjax.run.signals import Stop, StoppedError
 
-# Listens, says so, and then does what the last argument says.
+# A program that listens for signals, prints so, and then waits as its argument says.
 _PROCESS = """
 import ctypes, sys, time
 from swarmjax.run.signals import Stop
@@ -51,7 +51,7 @@ def test_a_signal_asks_to_stop_and_says_so(number: int, code: int) -> None:
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
     assert process.returncode == code
-    assert said == "stopping after this call, to save; a second signal stops at once\n"
+    assert said == "stopping after the current call, to save; a second signal stops at once\n"
 
 
 def test_a_second_signal_ends_the_process_even_within_a_call() -> None:
@@ -60,7 +60,7 @@ def test_a_second_signal_ends_the_process_even_within_a_call() -> None:
     time.sleep(0.3)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=10)
-    assert process.returncode == REQUEUE  # what the first one asked for
+    assert process.returncode == REQUEUE  # the code of the first signal
     assert "stopped at once" in said
 
 
@@ -82,7 +82,7 @@ def test_signals_are_given_back() -> None:
     assert [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGUSR1)] == before
 
 
-# Ends, as Python does after `sys.exit`, with a signal to itself on the way.
+# A program that sends a signal to itself while Python exits.
 _ENDING = """
 import atexit, os, sys
 from swarmjax.run.signals import Stop

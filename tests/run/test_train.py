@@ -1,4 +1,4 @@
-"""The command line from end to end: train, stop, resume, export, and every way to be refused."""
+"""Checks the command line from end to end: train, stop, resume, export, and all refusals."""
 
 import json
 import os
@@ -40,7 +40,7 @@ TINY = [
 ]
 
 
-# Two stages of which the first is left by its budget, since nobody is that good.
+# Two stages. The first stage ends by its budget, since no policy reaches a threshold of 1.0.
 SEVERAL = [
     "stage=curriculum",
     "stage.sequence=[s1,s2]",
@@ -59,7 +59,7 @@ def _digest(run: Path) -> str:
 
 
 def _rows(run: Path) -> list[dict]:
-    """Reads the metrics of a run, but for the wall clock."""
+    """Reads the metrics of a run, without the training time."""
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return [{k: v for k, v in json.loads(line).items() if k != "train_s"} for line in lines]
 
@@ -142,7 +142,7 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
 
 @pytest.fixture
 def copied(whole: Path, tmp_path: Path) -> Path:
-    """A copy of a run whose budget is spent."""
+    """Returns a copy of a run whose budget is spent."""
     return Path(shutil.copytree(whole, tmp_path / "copied"))
 
 
@@ -151,7 +151,7 @@ def _forbid_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _contents(run: Path) -> dict[Path, tuple[bytes, int]]:
-    """What every file of a run holds, and when it was written."""
+    """Returns the bytes and the modification time of every file of a run."""
     files = [path for path in run.rglob("*") if path.is_file() and path.name != LOCK]
     return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
@@ -212,7 +212,7 @@ def test_a_run_that_is_done_can_be_written_elsewhere(
 def test_a_run_with_a_price_of_contacts_goes_on_without_it(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a version wrote it that had `algo.contact_limit`, which is no longer a key."""
+    """Resumes a run of an old version with `algo.contact_limit`, which is no longer a key."""
     stopped = tmp_path / "stopped"
     assert _train(f"run.dir={stopped}", "run.stop_after=4") == 0
     stored = json.loads((stopped / "config.json").read_text())
@@ -230,7 +230,7 @@ def test_a_run_with_a_price_of_contacts_goes_on_without_it(
 
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seeds 3 and 4 in one run, on two stages; the first is left by its budget."""
+    """Returns a run of seeds 3 and 4 on two stages; the first stage ends by its budget."""
     run = tmp_path_factory.mktemp("several") / "run"
     assert _train(*SEVERAL, f"run.dir={run}", "run.chunk=2") == 0
     return run
@@ -255,7 +255,7 @@ def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
 def test_the_summary_of_several_seeds_has_a_list_for_each_figure(several: Path) -> None:
     rows, summary = _rows(several), json.loads((several / "summary.json").read_text())
     assert summary["seeds"] == [3, 4]
-    assert summary["arena_steps"] == 4 * 4 * 9  # of a seed
+    assert summary["arena_steps"] == 4 * 4 * 9  # of each seed
     transitions = [
         sum(row["transitions"] for row in rows if row["seed"] == seed) for seed in (3, 4)
     ]
@@ -266,7 +266,7 @@ def test_the_summary_of_several_seeds_has_a_list_for_each_figure(several: Path) 
     for seed, decisions, reached in zip(
         (3, 4), summary["decisions"], summary["targets_reached"], strict=True
     ):
-        # Half of nine updates for the first stage: it is left after the fifth.
+        # The first stage gets half of nine updates, so it ends after the fifth.
         moves = [
             (entry["update"], entry["seed"], entry["from"], entry["to"]) for entry in decisions
         ]
@@ -292,8 +292,9 @@ def test_several_seeds_resume_exactly(several: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("updates", "said"),
-    # A step limit of 8 is two updates of 4, the least that s1 takes; half of 3 updates, rounded
-    # up, is as much, half of 2 is not; and after 2 of 2 there is no update left.
+    # Stage s1 takes at least two updates of 4 control steps, since the step limit is 8. Half of 3
+    # updates, rounded up, is two updates; half of 2 is only one. With a budget of 2 updates, none
+    # is left for s2.
     [(3, ""), (2, "s2, may never begin, but curriculum.budget_share=0.5 asks for update 1")],
 )
 def test_a_budget_too_short_for_its_stages_is_said(updates: int, said: str) -> None:
@@ -451,7 +452,7 @@ def test_a_dry_run_compiles_and_leaves_nothing(
 
 
 def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
-    """Ctrl-C in a process of its own, well before the budget of many thousand updates is spent."""
+    """Interrupts a process long before it has spent its budget of a million updates."""
     words = [*TINY, f"budget={4 * 4 * 10**6}", f"run.dir={tmp_path}", "run.chunk=1"]
     code = "import sys; from swarmjax import train; sys.exit(train.main(sys.argv[1:]))"
     process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""When training stops by itself, and groups of seeds that are called at once."""
+"""Checks when checkpoints are due and training stops, and that groups of seeds run at once."""
 
 import threading
 import time
@@ -17,7 +17,7 @@ from swarmjax.run.signals import Stop
 
 
 def test_groups_are_called_at_once_and_keep_their_order() -> None:
-    together = threading.Barrier(3, timeout=60)  # breaks unless all three are under way
+    together = threading.Barrier(3, timeout=60)  # raises unless three calls run at once
 
     def call(schedule: Any, part: jax.Array, n: np.int32) -> tuple[jax.Array, dict]:
         together.wait()
@@ -33,12 +33,12 @@ def test_groups_are_called_at_once_and_keep_their_order() -> None:
 
 
 def _tally(update: int) -> trainer.Tally:
-    """After so many updates of 10 ms."""
+    """Returns the tally after this many updates of 10 ms each."""
     return trainer.Tally(update, 0, 0.0, {}, {}, seconds=0.01 * update)
 
 
 def _saves_each_90() -> trainer.Saves:
-    """Of a run of 900 updates, each tenth of which is saved."""
+    """Returns the saves of a run of 900 updates, with one checkpoint every 90 updates."""
     settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}"])
     run = RunConfig(checkpoint_minutes=99.0, checkpoint_share=0.1)
     return trainer.Saves(replace(settings, run=run), 0)
@@ -47,9 +47,9 @@ def _saves_each_90() -> trainer.Saves:
 @pytest.mark.parametrize(
     ("write_seconds", "begun"),
     [
-        (0.0, 90),  # one call later it would be 100
-        (0.2, 70),  # a write lasts 20 updates: 70 + 20 is 90
-        (9.0, 50),  # no earlier than half of the interval
+        (0.0, 90),  # waiting for one more call would give 100
+        (0.2, 70),  # a write lasts as long as 20 updates: 70 + 20 is 90
+        (9.0, 50),  # no earlier than after half of the interval
     ],
 )
 def test_a_checkpoint_is_begun_so_early_that_a_kill_repeats_one_interval(
@@ -63,13 +63,13 @@ def test_a_checkpoint_is_begun_so_early_that_a_kill_repeats_one_interval(
 def test_a_run_waits_for_a_checkpoint_that_is_not_written_within_the_interval() -> None:
     saves = _saves_each_90()
     begun = [n for n in range(10, 60, 10) if saves.due(_tally(n), write_seconds=9.0)]
-    assert begun == [50]  # the checkpoint before is that of update 0
+    assert begun == [50]  # the previous checkpoint is at update 0
     waits = [
         n
         for n in range(60, 100, 10)
         if not saves.due(_tally(n), 0.0) and saves.must_wait(_tally(n))
     ]
-    assert waits == [90]  # another call would end at 100
+    assert waits == [90]  # another call would end at update 100
 
 
 def test_a_stop_has_a_time_of_its_own() -> None:

@@ -1,4 +1,4 @@
-"""`start=DIR`: what a new run takes from another one, what it does not, and what is refused."""
+"""Checks `init_from=DIR`: what a new run takes from an earlier run, and what is refused."""
 
 import gc
 import json
@@ -36,8 +36,8 @@ TINY = [
     f"budget={4 * 4 * UPDATES}",
     "run.tensorboard=false",
 ]
-# Another body, realism, arena and budget, all with the observations of TINY; an episode of real
-# realism must outlast its stalls of 0.3 s.
+# Another body, realism, arena and budget, with the same observations as TINY. With realism=real, an
+# episode must be longer than the stalls of 0.3 s.
 OTHER = [
     "robot=wheeled",
     "realism=real",
@@ -49,19 +49,19 @@ OTHER = [
 CARRIED = ("learners/params/", "learners/normalizer/")
 LOG_STD = "learners/params/actor/log_std"
 
-# Where a restore fails, Orbax leaves an event loop that complains when it is collected.
+# After a failed restore, Orbax leaves an event loop that warns when it is garbage-collected.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 
 @pytest.fixture(autouse=True)
 def _collected() -> Iterator[None]:
     yield
-    gc.collect()  # here, and not in some other test
+    gc.collect()  # so that the warning comes in this test
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three updates, with checkpoints after the second and the third."""
+    """Returns a run of three updates, with checkpoints after the second and the third."""
     run = tmp_path_factory.mktemp("trained") / "run"
     words = [f"run.dir={run}", "run.chunk=1", "run.checkpoint_minutes=0"]
     assert train.main([*TINY, *words]) == 0
@@ -69,7 +69,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
-    """What is carried over, the state of the same run without it, and the config."""
+    """Returns the source of a warm start, the state of the run without it, and the config."""
     settings = load_train([*TINY, *words])
     source = warm_start.read(settings)
     assert source is not None
@@ -77,7 +77,7 @@ def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
 
 
 def _rows(run: Path) -> list[dict]:
-    """Reads the metrics of a run, but for the wall clock."""
+    """Reads the metrics of a run, without the training time."""
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return [{k: v for k, v in json.loads(line).items() if k != "train_s"} for line in lines]
 
@@ -111,24 +111,26 @@ def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> 
     learned = checkpoint.restore(trained)[0]
     assert found.keys() == fresh.keys()
     carried = {name for name in found if name.startswith(CARRIED)}
-    # A kernel and a bias for each of 2 x 2 layers, log_std; count, mean, variance.
+    # The networks have a kernel and a bias in each of 2 x 2 layers, and log_std. The normaliser has
+    # count, mean and variance.
     assert len(carried) == 2 * 2 * 2 + 1 + 3
     for name, leaf in found.items():
         expected = learned[name] if name in carried else fresh[name]
         np.testing.assert_array_equal(leaf, expected, err_msg=name, strict=True)
-    # What is compared differs: every carried leaf was trained, and so was the optimiser.
+    # Training has changed every carried leaf and the optimiser, so the comparison above can fail.
     for name in carried | {name for name in found if "/mu/" in name}:
         assert np.any(learned[name] != fresh[name]), name
     counts = [name for name in found if name.endswith("/count") and "optimizer_state" in name]
     assert counts
     for name in counts:
-        assert learned[name].tolist() == [[UPDATES * 2]], name  # a step for each minibatch
+        assert learned[name].tolist() == [[UPDATES * 2]], name  # one step for each minibatch
         assert found[name].tolist() == [[0]], name
     assert (learned["update"].tolist(), found["update"].tolist()) == ([UPDATES], [0])
 
 
 def test_it_is_known_how_many_robots_have_trained(trained: Path) -> None:
-    # A promotion copies no learner over one that has learned: two robots trained, one begins.
+    # Two robots have trained, and the new run begins with one. Its promotions must not copy a
+    # learner over a learner that has trained.
     source, state, settings = _load(["stage.robots=1", f"init_from={trained}"])
     assert state.curriculum.met.tolist() == [1]
     assert warm_start.carry(source, state, settings).curriculum.met.tolist() == [2]
@@ -167,14 +169,14 @@ def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
     begun = f"init_from={tmp_path / 'run'}"
     assert explored(*SCHEDULED, begun) == [UPDATES * 16]  # four arenas, rollouts of four
     assert explored(*SCHEDULED, begun, "init_from_std=reset") == [0]
-    # A learned deviation has no schedule to go on with, and needs none.
+    # A learned deviation has no schedule that could go on.
     assert explored(*SCHEDULED, f"init_from={trained}") == [0]
     assert explored(begun) is None
 
 
 @pytest.fixture(scope="module")
 def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two seeds, its second lane the first one's numbers and 1."""
+    """Returns a run of two seeds; the second seed has the numbers of the first, plus 1."""
     run = tmp_path_factory.mktemp("pair") / "run"
     learned = checkpoint.restore(trained)[0]
     lanes = {name: np.concatenate([leaf, leaf + 1]) for name, leaf in learned.items()}
@@ -228,7 +230,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_said(
     assert train.main([*TINY, f"init_from={damaged}", f"run.dir={run}", "run.stop_after=0"]) == 0
     output = capsys.readouterr().out
     assert f"checkpoint 3 of {damaged} cannot be used (its files do not match" in output
-    assert f"what {damaged} had learned after 2 updates" in output
+    assert f"the networks and the normaliser of {damaged} after 2 updates" in output
     found, update, _ = checkpoint.restore(run)
     assert update == 0
     before = checkpoint.restore(trained, 2)[0]

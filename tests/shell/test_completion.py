@@ -1,4 +1,4 @@
-"""What shells complete behind `swarmjax`."""
+"""Checks the words that shells offer after `swarmjax`."""
 
 import shlex
 import shutil
@@ -25,7 +25,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 
 @pytest.fixture(scope="module")
 def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the script of each shell, and a policy."""
+    """Returns a folder with the completion script of each shell, and a policy."""
     folder = tmp_path_factory.mktemp("completion")
     for shell in completion.SHELLS:
         (folder / f"script.{shell}").write_text(completion.script(shell))
@@ -34,7 +34,10 @@ def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _bash(folder: Path, line: str) -> list[str]:
-    """The words that bash offers for the end of a line, `=` parting words as it does by default."""
+    """Returns the words that bash offers for the end of a line.
+
+    The sign `=` separates words, as by default.
+    """
     words = line.split(" ")
     code = BASH.format(script="script.bash")
     done = subprocess.run(
@@ -49,7 +52,7 @@ def _bash(folder: Path, line: str) -> list[str]:
 
 
 def _fish(folder: Path, line: str) -> list[str]:
-    """The words that fish offers for the end of a line, without what it says of them."""
+    """Returns the words that fish offers for the end of a line, without their descriptions."""
     done = subprocess.run(
         ["fish", "-N", "-c", f"source script.fish; complete -C {shlex.quote(line)}"],
         cwd=folder,
@@ -62,7 +65,7 @@ def _fish(folder: Path, line: str) -> list[str]:
     return [each.partition("\t")[0] for each in done.stdout.splitlines()]
 
 
-# What is offered for the end of a line: by bash, which replaces what follows `=`.
+# The words that bash offers for the end of a line. Bash replaces only the part after `=`.
 OFFERED = [
     ("swarmjax ver", {"verify"}),
     ("swarmjax --vers", {"--version"}),

@@ -1,4 +1,4 @@
-"""`swarmjax COMMAND` is `python -m swarmjax.COMMAND`."""
+"""Checks that `swarmjax COMMAND` does the same as `python -m swarmjax.COMMAND`."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from swarmjax import command
 from swarmjax.shell import entry
 from swarmjax.shell.commands import COMMANDS, settings
 
-# What needs neither JAX nor what trains: a command, its module is imported in a process of its own.
+# Packages that help and completion must not import.
 _HEAVY = ("jax", "flax", "optax", "orbax", "matplotlib")
 
 

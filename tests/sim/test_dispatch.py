@@ -1,4 +1,4 @@
-"""Which way is taken, and that things go through in pieces to the same end."""
+"""Tests the choice of implementation and solver, and minima over the pieces of an axis."""
 
 import sys
 from functools import partial

@@ -1,4 +1,4 @@
-"""The drive against the table of the e-puck's wheels, and its inverse."""
+"""Tests the drive and its inverse against a table of the e-puck's wheel speeds."""
 
 from typing import Any
 
@@ -15,10 +15,10 @@ from swarmjax.sim.config import RobotConfig
 EPUCK = drive.from_config(RobotConfig())
 PAPER = EPUCK._replace(max_speed=0.25)  # the speed the paper commands, which no e-puck reaches
 
-# Command (m/s, rad/s), wheels left and right before the clamp (rad/s), and what the robot then
-# does (m/s, rad/s): (v -+ w * 0.026) / 0.02, each clamped to +-6.28; v = 0.01 * (L + R),
-# w = 0.02 * (R - L) / 0.052. Two decimals for wheels and turn rates, three for speeds (four where
-# the third would be rounded twice).
+# Each row holds a command (m/s, rad/s), the left and right wheel speeds before the clamp (rad/s),
+# and the robot's motion (m/s, rad/s). The wheel speeds are (v -+ w * 0.026) / 0.02, each then
+# clamped to +-6.28. The motion is v = 0.01 * (L + R) and w = 0.02 * (R - L) / 0.052. Wheel speeds
+# and turn rates have two decimals, speeds three (four where the third would be rounded twice).
 TABLE = [
     ((0.0, 3.14), (-4.08, 4.08), (0.0, 3.14)),
     ((0.0625, 3.14), (-0.96, 7.21), (0.053, 2.78)),
@@ -49,8 +49,8 @@ def test_wheels_and_motion_of_the_table(
     expected = np.clip(unclipped, -epuck.MAX_WHEEL_SPEED, epuck.MAX_WHEEL_SPEED)
     np.testing.assert_allclose(wheels, expected, atol=0.005)  # half of the table's last digit
     speed, turn_rate = _roll(wheels, EPUCK, np)
-    assert speed == pytest.approx(realised[0], abs=0.0005)  # likewise
-    assert turn_rate == pytest.approx(realised[1], abs=0.005)  # likewise
+    assert speed == pytest.approx(realised[0], abs=0.0005)  # as above
+    assert turn_rate == pytest.approx(realised[1], abs=0.005)  # as above
 
 
 @pytest.mark.parametrize(("command", "unclipped", "realised"), TABLE)
@@ -75,7 +75,7 @@ def test_wheels_without_a_limit(
 def test_action_spans_the_command(
     action: tuple[float, float], expected: tuple[float, float]
 ) -> None:
-    # 1e-15 m/s and rad/s: rounding of float64.
+    # 1e-15 m/s and 1e-15 rad/s are the rounding of float64.
     np.testing.assert_allclose(drive.command(np.array(action), EPUCK, np), expected, atol=1e-15)
 
 
@@ -97,9 +97,9 @@ def test_body_velocity_is_the_inverse_where_nothing_is_clamped(left: float, righ
     wheels = np.array([left, right])
     command = _roll(wheels, EPUCK, np)
     again = drive.wheel_speeds(command, EPUCK, np)
-    # 1e-14 rad/s: a few roundings of float64 at 6.28.
+    # 1e-14 rad/s is a few roundings of float64 at 6.28.
     np.testing.assert_allclose(again, wheels, atol=1e-14)
-    # 1e-15 m/s and 1e-14 rad/s: likewise.
+    # 1e-15 m/s and 1e-14 rad/s are a few roundings of float64 here.
     np.testing.assert_allclose(_roll(again, EPUCK, np), command, atol=1e-14)
 
 
@@ -112,5 +112,5 @@ def test_numpy_and_jax_drive_alike(first: float, second: float) -> None:
         wheels = drive.wheel_speeds(command, PAPER, xp)
         results.append([command, wheels, _roll(wheels, PAPER, xp)])
     for expected, found in zip(*results, strict=True):
-        # float32 rounds differently where XLA multiplies by a reciprocal: 2e-6 is 4 ulp at 6.28.
+        # XLA multiplies by a reciprocal and so rounds float32 differently. 2e-6 is 4 ulp at 6.28.
         np.testing.assert_allclose(found, expected, atol=2e-6)

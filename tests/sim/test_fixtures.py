@@ -1,4 +1,4 @@
-"""Obstacles and walls that move: in MJX geoms of the world, told anew, in MuJoCo C mocap bodies."""
+"""Tests obstacles and walls that move: as world geoms in MJX, as mocap bodies in MuJoCo C."""
 
 import functools
 from collections.abc import Iterator
@@ -35,8 +35,8 @@ from swarmjax.training import program as programs
 
 SIZE = model.ArenaSize(ROBOTS, OBSTACLES, BIGGEST_HALF)
 AHEAD = wheels_of(np.array([FULL, 0.0]))
-CLEAR = 0.01  # m; what is in a robot's way is this far from its hull when it is put there
-WAY = FULL * STEP * CHUNK  # m; 0.0804, what a robot goes in a scene if nothing is in its way
+CLEAR = 0.01  # m; the gap to a robot's hull when an obstacle or wall is put in its way
+WAY = FULL * STEP * CHUNK  # m; 0.0804, the distance that a free robot drives in a scene
 
 
 class Scenes(NamedTuple):
@@ -46,17 +46,17 @@ class Scenes(NamedTuple):
     obstacle: np.ndarray
 
 
-# Robots 0, 1 and 2 drive +x, +y and -x, and in each scene these are stopped.
+# Robots 0, 1 and 2 drive along +x, +y and -x. `STOPPED` lists which of them each scene stops.
 START = np.array([[0.0, 0.0, 0.0], [-0.1, 0.15, np.pi / 2], [0.1, -0.15, np.pi]])
 STOPPED = np.array([[True, True, False], [False, False, True], [True, True, False]])
 
 
 def _scenes() -> tuple[np.ndarray, Scenes]:
-    """Starts [A, R, 3] and scenes, each arena's a quarter turn on from the one before.
+    """Returns starting poses [A, R, 3] and scenes, turned by a quarter turn from arena to arena.
 
-    A box stops robot 0 and the north wall robot 1; then the wall is gone and the box, smaller, is
-    before robot 2; then it is narrow, turned by a right angle and before robot 0, and another one
-    is before robot 1.
+    In the first scene a box stops robot 0 and the north wall stops robot 1. In the second scene the
+    wall is gone, and a smaller box stops robot 2. In the third scene a narrow box, turned by a
+    right angle, stops robot 0, and another box stops robot 1.
     """
     near = RADIUS + CLEAR
     first = [near + 0.05, 0.0, 0.0, 0.05, 0.05]
@@ -67,13 +67,14 @@ def _scenes() -> tuple[np.ndarray, Scenes]:
     quarter = 0.5 * np.pi * np.arange(ARENAS)
     pose = np.stack([_turn(START, angle) for angle in quarter])
     obstacle = np.stack([_turn(boxes, angle) for angle in quarter], axis=1)
-    # A tenth of a millimetre an arena, so that no two arenas are alike.
+    # The walls are 0.1 mm farther out in each arena than in the one before, so that no two arenas
+    # are alike.
     closest = 2.0 * (0.15 + near + 1e-4 * np.arange(ARENAS))
     return pose, Scenes(np.stack([closest, closest + 0.6, closest + 0.8]), obstacle)
 
 
 def _turn(things: np.ndarray, angle: float) -> np.ndarray:
-    """Things [..., 3+] with x, y and yaw, turned about the origin."""
+    """Turns things [..., 3+] with x, y and yaw about the origin."""
     c, s = np.cos(angle), np.sin(angle)
     x, y, yaw = things[..., 0], things[..., 1], things[..., 2] + angle
     return np.concatenate([np.stack([c * x - s * y, s * x + c * y, yaw], -1), things[..., 3:]], -1)
@@ -82,15 +83,16 @@ def _turn(things: np.ndarray, angle: float) -> np.ndarray:
 @pytest.fixture(
     scope="module",
     params=[
-        # It compiles for 20 s a test; test_physics.py and test_engine_c.py, where robots meet an
-        # obstacle, hold it to MuJoCo C as well.
+        # MJX by `jax` compiles for 20 s per test, so it is slow. Other tests, in test_physics.py
+        # and test_engine_c.py, compare it with MuJoCo C where robots meet an obstacle.
         pytest.param(each, marks=pytest.mark.slow if each[0] == "jax" else ())
         for each in ENGINES
     ],
     ids="-".join,
 )
 def loaded(request: pytest.FixtureRequest) -> Iterator[physics.Physics]:
-    # A program of Warp calls back into the process that compiled it: it is not for the disk.
+    # A program that uses Warp calls back into the process that compiled it, so it must not be
+    # cached on disk.
     seconds = jax.config.jax_persistent_cache_min_compile_time_secs
     if request.param[0] == "warp":
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
@@ -99,7 +101,7 @@ def loaded(request: pytest.FixtureRequest) -> Iterator[physics.Physics]:
 
 
 def _drive(loaded: physics.Physics, pose: np.ndarray, scenes: Scenes) -> np.ndarray:
-    """Poses [T, A, R, 3] of robots that drive ahead through the scenes, by MJX."""
+    """Drives robots ahead through the scenes in MJX and returns their poses [T, A, R, 3]."""
     wheels = jnp.broadcast_to(jnp.asarray(AHEAD, jnp.float32), (ROBOTS, 2))
     step = jax.vmap(lambda data, side, obstacle: physics.step(loaded, data, side, obstacle, wheels))
 
@@ -124,7 +126,10 @@ def _drive(loaded: physics.Physics, pose: np.ndarray, scenes: Scenes) -> np.ndar
 def _drive_in_c(
     robot: RobotConfig, pose: np.ndarray, scenes: Scenes, fixtures: model.Fixtures = "mocap"
 ) -> np.ndarray:
-    """The same, one arena [R, 3] with side [3] and obstacles [3, M, 5] by MuJoCo C: [T, R, 3]."""
+    """Drives the robots of one arena in MuJoCo C and returns their poses [T, R, 3].
+
+    The arena has starting poses [R, 3], sides [3] and obstacles [3, M, 5].
+    """
     count, body = physics_substeps(robot, None), model.BODIES[robot.body]
     built = compile_in_c(robot, scenes.obstacle[0], count, fixtures)
     data, ids = mujoco.MjData(built), model.ids(built, SIZE)
@@ -150,7 +155,7 @@ def _place_in_c(
     side: float,
     obstacle: np.ndarray,
 ) -> None:
-    """Moves obstacles and walls of either description."""
+    """Moves obstacles and walls, which are mocap bodies or geoms of the world."""
     built.geom_size[ids.obstacle_geom, :2] = obstacle[:, 3:]
     place, turn = model.fixture_poses(side, obstacle, np)
     if (ids.fixture_mocap >= 0).all():
@@ -158,7 +163,7 @@ def _place_in_c(
         return
     built.geom_pos[ids.fixture_geom] = place + np.array([0.0, 0.0, model.HALF_HEIGHT])
     built.geom_quat[ids.fixture_geom] = turn
-    # They were compiled turned as the world is, and MuJoCo C takes them to stay so.
+    # The geoms were compiled with the world's orientation, and MuJoCo C assumes that they keep it.
     built.geom_sameframe[ids.fixture_geom] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
@@ -174,9 +179,9 @@ def test_what_moves_stops_a_robot_where_it_is_and_no_longer_where_it_was(
     ends = np.concatenate([pose[None], path[CHUNK - 1 :: CHUNK]])[..., :2]
     gone = np.linalg.norm(np.diff(ends, axis=0), axis=-1)  # [3, A, R]
     stopped = np.broadcast_to(STOPPED[:, None], gone.shape)
-    # Who is free goes 80 mm; wheels that slip when their way is cleared find their grip after 4 mm.
-    # Who is stopped goes 10 mm, and sinks by the 4 mm of a control step at most; and 3 mm either
-    # way, since what happened in a scene put it elsewhere than the next one expects.
+    # A free robot drives 80 mm, less up to 4 mm if its wheels still slip when its way is cleared. A
+    # stopped robot drives 10 mm and sinks in by at most the 4 mm of a control step. Another 3 mm
+    # either way allow for the robot's position after the previous scene.
     assert np.all(gone[~stopped] > WAY - 0.005)
     assert np.all(gone[stopped] < CLEAR + 0.007)
     assert np.all(gone[stopped] > CLEAR - 0.003)
@@ -188,7 +193,7 @@ def test_what_moves_is_met_as_in_c(loaded: physics.Physics) -> None:
     arenas = [_drive_in_c(loaded.robot, pose[a], _arena(scenes, a)) for a in range(ARENAS)]
     apart = np.abs(found - np.stack(arenas, axis=1))
     apart[..., 2] = np.abs(turned(apart[..., 2]))
-    # As in test_physics.py: float32, in contact.
+    # The bounds are those of test_physics.py for float32 in contact.
     planar = loaded.robot.body == "planar"
     assert apart[..., :2].max() <= (1.3e-5 if planar else 3e-5)  # m
     assert apart[..., 2].max() <= (2e-5 if planar else 5e-4)  # rad
@@ -196,7 +201,7 @@ def test_what_moves_is_met_as_in_c(loaded: physics.Physics) -> None:
 
 @pytest.mark.parametrize("body", ["planar", "wheeled"])
 def test_both_descriptions_are_one_world(body: BodyName) -> None:
-    """Obstacles and walls as bodies or geoms; planar robots' servos as actuators or forces."""
+    """Compares fixtures as bodies and as geoms, and planar servos as actuators and as forces."""
     pose, scenes = _scenes()
     drive = functools.partial(_drive_in_c, RobotConfig(body=body))
     for arena in range(4):
@@ -205,4 +210,4 @@ def test_both_descriptions_are_one_world(body: BodyName) -> None:
         )
         apart = np.abs(world - mocap)
         apart[..., 2] = np.abs(turned(apart[..., 2]))
-        assert apart.max() <= 1e-9  # m and rad: float64, of which wheels that slip make 7e-13
+        assert apart.max() <= 1e-9  # m and rad; float64 gives 7e-13 with wheels that slip

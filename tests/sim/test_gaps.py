@@ -1,4 +1,4 @@
-"""Gaps worked out by hand, and what counts as one contact."""
+"""Tests gaps against values computed by hand, and what counts as one contact."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,7 @@ RADIUS = 0.037
 STEP = 0.032  # s
 ALONE = np.zeros((1, 3), np.float32)
 NO_OBSTACLE = np.zeros((0, 5), np.float32)
-# 1e-6 m: float32 at the size of an arena.
+# 1e-6 m is the rounding of float32 at the size of an arena.
 TOLERANCE = 1e-6
 
 
@@ -23,7 +23,7 @@ def _gaps(pose: object, side: float, obstacle: object = NO_OBSTACLE) -> np.ndarr
 
 
 def test_robots() -> None:
-    # 3-4-5 triangle: centres 0.1, 0.05 and sqrt(0.04^2 + 0.03^2) = 0.05 apart.
+    # The centres are 0.1, 0.05 and sqrt(0.04^2 + 0.03^2) = 0.05 apart (3-4-5 triangles).
     pose = [[0.0, 0.0, 0.0], [0.06, 0.08, 1.0], [0.03, 0.04, 2.0]]
     found = _gaps(pose, 2.0)[:, 0]
     np.testing.assert_allclose(found, 0.05 - 0.074, atol=TOLERANCE)
@@ -67,7 +67,7 @@ def test_nothing_of_the_kind_is_infinitely_far() -> None:
 
 
 def _begins(gap: list[float], *, apart: float = gaps.CONTACT_PAUSE) -> list[bool]:
-    """Contacts that begin at each step of one robot's gap to one kind of thing."""
+    """Returns whether a contact begins at each step, given one robot's gap at each step."""
     found = []
     clock = np.full((1, 3), apart)
     for value in gap:
@@ -90,17 +90,19 @@ def test_contact_at_the_start_counts() -> None:
 
 
 def test_bounce_is_the_same_contact() -> None:
-    # Two open steps, 0.064 s, are shorter than the pause of 0.1 s; so is any number of such.
+    # Two open steps last 0.064 s, which is shorter than the pause of 0.1 s. Any number of such
+    # bounces belongs to one contact.
     assert _begins([CLOSED, OPEN, OPEN, CLOSED, OPEN, CLOSED]) == [True] + [False] * 5
 
 
 def test_contact_after_the_pause_is_another() -> None:
-    # Three open steps are 0.096 s, which is the pause to the nearest control step.
+    # Three open steps last 0.096 s, which is the pause rounded to whole control steps.
     assert _begins([CLOSED, OPEN, OPEN, OPEN, CLOSED]) == [True, False, False, False, True]
 
 
 def test_pause_of_whole_steps_is_kept_whatever_the_rounding() -> None:
-    # With 0.1 s in ten steps of 0.01 s, whose float sum is not 0.1: nine are too few, ten enough.
+    # The pause of 0.1 s is ten steps of 0.01 s, whose floating-point sum is not exactly 0.1. Nine
+    # steps are too few, and ten are enough.
     for steps, expected in ((9, False), (10, True)):
         clock = np.zeros((1, 3), np.float32)
         for _ in range(steps):
@@ -115,5 +117,5 @@ def test_kinds_and_robots_are_counted_apart() -> None:
     gap[0, 1] = gap[1, 2] = CLOSED
     begins, apart = gaps.count_contacts(gap, np.full((2, 3), 0.5), STEP, np)
     assert begins.tolist() == [[False, True, False], [False, False, True]]
-    # 1e-12 s: rounding of float64.
+    # 1e-12 s is the rounding of float64.
     np.testing.assert_allclose(apart, np.where(begins, 0.0, 0.532), atol=1e-12)

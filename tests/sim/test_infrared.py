@@ -1,4 +1,4 @@
-"""Infrared rays against hand-worked numbers, and against MuJoCo's own rays."""
+"""Tests infrared rays against numbers computed by hand and against MuJoCo's own rays."""
 
 import functools
 import math
@@ -25,7 +25,7 @@ RANGE = 0.04  # m
 RADIUS = 0.037  # m
 HALF_ROOT = math.sqrt(0.5)
 MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-ROUNDING = 1e-6  # some roundings of float32 (6e-8) of lengths up to 1 m
+ROUNDING = 1e-6  # m; several roundings of float32 (6e-8) of lengths up to 1 m
 
 
 def _f32(*values: Any) -> np.ndarray:
@@ -44,7 +44,7 @@ def _ray(xp: ModuleType, origin: tuple, direction: tuple) -> infrared.Ray:
         ((0.1, 0.0), (-1.0, 0.0), 0.6),
         ((0.1, -0.2), (0.0, -1.0), 0.3),
         ((0.4, 0.0), (HALF_ROOT, HALF_ROOT), 0.1 * math.sqrt(2.0)),  # meets the east wall first
-        ((0.3, 0.4), (HALF_ROOT, HALF_ROOT), 0.1 * math.sqrt(2.0)),  # the north wall first
+        ((0.3, 0.4), (HALF_ROOT, HALF_ROOT), 0.1 * math.sqrt(2.0)),  # meets the north wall first
         ((0.0, 0.49), (1.0, 0.0), 0.5),  # along the north wall
         ((0.5, 0.1), (-1.0, 0.0), 0.0),  # on the wall
         ((0.51, 0.1), (-1.0, 0.0), 0.0),  # inside the wall, looking out
@@ -71,7 +71,7 @@ def test_ray_walls(xp: ModuleType, origin: tuple, direction: tuple, expected: fl
     ],
 )
 def test_ray_disc(xp: ModuleType, origin: tuple, expected: float) -> None:
-    """A disc of radius 0.25 at (1, 0), from the left along +x."""
+    """Casts rays along +x at a disc of radius 0.25 centred at (1, 0)."""
     x, y = xp.array(_f32(1.0, 0.0))
     found = infrared.ray_disc(_ray(xp, origin, (1.0, 0.0)), x, y, 0.25, xp)
     assert float(found) == pytest.approx(expected, abs=ROUNDING)
@@ -88,10 +88,11 @@ def test_ray_disc(xp: ModuleType, origin: tuple, expected: float) -> None:
         ((2.0, 0.0), (1.0, 0.0), (1.0, 0.0, 0.0, 0.25, 0.5), math.inf),  # behind
         ((1.0, 0.3), (1.0, 0.0), (1.0, 0.0, 0.0, 0.25, 0.5), 0.0),  # inside
         ((1.2, 0.4), (0.0, -1.0), (1.0, 0.0, 0.0, 0.25, 0.5), 0.0),
-        # Turned by a quarter, the long side lies along x.
+        # The box is turned by a quarter turn, so its long side lies along x.
         ((0.0, 0.0), (1.0, 0.0), (1.0, 0.0, math.pi / 2, 0.25, 0.5), 0.5),
         ((0.0, 0.3), (1.0, 0.0), (1.0, 0.0, math.pi / 2, 0.25, 0.5), math.inf),
-        # On its corner: half a diagonal of 0.25 * sqrt(2) before the centre; 0.1 off, 0.1 later.
+        # The box is turned by an eighth of a turn, so a corner lies half a diagonal,
+        # 0.25 * sqrt(2), before the centre. A ray 0.1 beside the corner meets the box 0.1 later.
         ((0.0, 0.0), (1.0, 0.0), (1.0, 0.0, math.pi / 4, 0.25, 0.25), 1 - 0.25 * math.sqrt(2)),
         ((0.0, 0.1), (1.0, 0.0), (1.0, 0.0, math.pi / 4, 0.25, 0.25), 1.1 - 0.25 * math.sqrt(2)),
         ((0.0, 0.36), (1.0, 0.0), (1.0, 0.0, math.pi / 4, 0.25, 0.25), math.inf),
@@ -110,10 +111,11 @@ def test_ray_box(
 @pytest.mark.parametrize("quarter", range(4))
 def test_the_eight_sensors_of_a_robot_that_faces_a_wall(xp: ModuleType, quarter: int) -> None:
     yaw = quarter * math.pi / 2
-    # Its centre 0.048 m before the wall: 11 mm between hull and wall.
+    # The robot's centre is 0.048 m from the wall, which leaves 11 mm between hull and wall.
     pose = _f32([0.452 * math.cos(yaw), 0.452 * math.sin(yaw), yaw])
     expected = np.full(8, RANGE)
-    # x forward of the centre and yaw of the sensors that look forward; the other four see nothing.
+    # Each row holds the number, x and yaw of a sensor that looks forward. The other four sensors
+    # see nothing.
     for sensor, x, bearing in (
         (0, 0.030, -0.30081),
         (1, 0.022, -0.80081),
@@ -128,7 +130,8 @@ def test_the_eight_sensors_of_a_robot_that_faces_a_wall(xp: ModuleType, quarter:
 
 @MODULES
 def test_a_sensor_behind_the_surface_of_a_wall_reads_zero(xp: ModuleType) -> None:
-    # 9 mm of the hull are inside the wall: sensors 0 and 7, 0.030 m forward, by 2 mm.
+    # The hull is 9 mm inside the wall. Sensors 0 and 7, 0.030 m ahead of the centre, are 2 mm
+    # inside the wall.
     pose = xp.array(_f32([0.472, 0.0, 0.0]))
     found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp)[0]
     expected = [0.0, 0.006 / math.cos(0.80081), RANGE, RANGE]
@@ -141,7 +144,7 @@ def test_two_robots_side_by_side_see_each_other_and_not_themselves(xp: ModuleTyp
     pose = xp.array(_f32([0.0, 0.0, 0.0], [0.0, 0.10, 0.0]))
     found = infrared.distances(pose, _f32(2.0)[0], _no_box(xp), RADIUS, RANGE, xp)
     expected = np.full((2, 8), RANGE)
-    # The side sensors sit 0.031 m off the centre and look along the line of the centres.
+    # The side sensors sit 0.031 m from the centre and look along the line between both centres.
     expected[0, 5] = expected[1, 2] = 0.10 - 0.031 - RADIUS
     np.testing.assert_allclose(found, expected, atol=ROUNDING)
 
@@ -150,7 +153,7 @@ def test_two_robots_side_by_side_see_each_other_and_not_themselves(xp: ModuleTyp
 def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
     xp: ModuleType,
 ) -> None:
-    """Two robots that look along +y; of the second, the right sensor is crooked."""
+    """Checks the rays of two robots that face +y; the second robot's right sensor is crooked."""
     pose = xp.array(_f32([0.1, 0.2, math.pi / 2], [-0.3, 0.0, math.pi / 2]))
     yaw = np.zeros((2, 8), np.float32)
     yaw[1, 2] = math.pi / 6
@@ -165,9 +168,11 @@ def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
         np.testing.assert_allclose(
             np.asarray(found)[keep], np.asarray(nominal)[keep], atol=ROUNDING
         )
-    # Forward is +y and left is -x: the sensor at (0, -0.031) of its robot comes to (0.002, -0.028).
+    # Forward is +y and left is -x. In its robot's frame the shift moves the sensor from (0, -0.031)
+    # to (0.002, -0.028).
     np.testing.assert_allclose(origin[1, 2], [-0.3 + 0.028, 0.002], atol=ROUNDING)
-    # It looks along +x, the robot's right, and 30 degrees further to the left, towards +y.
+    # A straight sensor would look along +x, the robot's right. This sensor is turned by 30 degrees
+    # to the left, towards +y.
     np.testing.assert_allclose(
         direction[1, 2], [math.cos(math.pi / 6), math.sin(math.pi / 6)], atol=ROUNDING
     )
@@ -182,7 +187,8 @@ def test_a_crooked_sensor_measures_along_its_own_ray(xp: ModuleType) -> None:
     shift[0, 0, 0] = 0.001
     mount = infrared.Mount(yaw=xp.array(yaw), position=xp.array(shift))
     found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, mount)[0]
-    # The wall is 0.05 m before the centre and the two front sensors sit at 0.030.
+    # The wall is 0.05 m ahead of the centre. The two front sensors sit 0.030 m ahead of the centre
+    # before their shifts.
     np.testing.assert_allclose(
         found[np.array([0, 7])], [0.019 / math.cos(0.30081), 0.021], atol=ROUNDING
     )
@@ -199,22 +205,26 @@ def _reflectance(xp: ModuleType, **shades: Any) -> infrared.Reflectance:
 
 @MODULES
 def test_sights_tell_how_bright_the_nearest_thing_is(xp: ModuleType) -> None:
-    """Robot 1 is left of robot 0, a box right of it, the wall behind; the second box is far."""
+    """Checks a robot with another robot on its left, a box on its right and the wall behind it.
+
+    The second box and robot 2 are out of range.
+    """
     pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0], [0.2, 0.3, 0.0]))
     box = xp.array(_f32([-0.45, -0.06, 0.0, 0.01, 0.01], [0.2, 0.0, 0.0, 0.02, 0.02]))
     distance, bright = infrared.sights(
         pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
     )
-    expected = np.ones((3, 8))  # where nothing is
+    expected = np.ones((3, 8))  # 1 where a sensor sees nothing
     expected[0, 5] = 0.4
     expected[1, 2] = 0.3
     expected[0, 2] = 0.6
-    expected[:2, [3, 4]] = 0.9  # 0.05 m behind the centre, 0.02 m behind the sensors
+    expected[:2, [3, 4]] = 0.9  # the wall, 0.02 m behind the sensors
     np.testing.assert_allclose(bright, expected, atol=ROUNDING)
     np.testing.assert_array_equal(
         distance, infrared.distances(pose, _f32(1.0)[0], box, RADIUS, RANGE, xp)
     )
-    # 0.031 m off the centre; the box's face 0.05 m, the other hull's surface 0.09 - 0.037 m.
+    # The sensors sit 0.031 m from the centre. The box's face is 0.05 m from the centre, and the
+    # other robot's hull 0.09 - 0.037 m.
     np.testing.assert_allclose(distance[0, [2, 5]], [0.019, 0.022], atol=ROUNDING)
 
 
@@ -234,7 +244,8 @@ def test_what_has_no_reflectance_of_its_own_is_as_bright_as_can_be(xp: ModuleTyp
 def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
     xp: ModuleType,
 ) -> None:
-    # Sensors 0 and 7 are inside both boxes; 2 mm further on, inside the wall as well.
+    # In the first pose sensors 0 and 7 are inside both boxes. In the second pose both sensors are
+    # inside the second box and 2 mm inside the wall.
     box = xp.array(_f32([0.47, 0.0, 0.0, 0.03, 0.03], [0.48, 0.0, 0.0, 0.03, 0.03]))
     for x, shade in ((0.45, 0.7), (0.472, 0.9)):
         pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
@@ -250,7 +261,7 @@ def _no_box(xp: ModuleType) -> Any:
 
 
 def _judge(stage: StageConfig) -> Judge:
-    """Returns a judge whose policy is never asked."""
+    """Returns a judge whose policy is never run."""
     layer = (np.zeros((1, observation.SIZE, 2)), np.zeros((1, 2)))
     size = np.zeros((1, observation.SIZE))
     policy = Policy(
@@ -270,11 +281,15 @@ def _judge(stage: StageConfig) -> Judge:
 
 ROBOTS, BOXES, ARENAS = 5, 2, 200
 SIDE = 0.8
-SUNK = 0.010  # m; deeper than robots sink into anything, 4 mm, and than the sensors sit, 6 mm
+SUNK = 0.010  # m; robots sink in by at most 4 mm, and sensors sit 6 mm inside the hull
 
 
 def _scenes() -> tuple[np.ndarray, np.ndarray]:
-    """Draws poses [A, R, 3] near things and boxes [A, M, 5]; hulls overlap by `SUNK` at most."""
+    """Draws poses [A, R, 3] and boxes [A, M, 5].
+
+    Each hull is at most 0.03 m from a wall, a box or another hull, and overlaps nothing by more
+    than `SUNK`.
+    """
     draw = np.random.default_rng(0)
     poses, boxes = [], []
     while len(poses) < ARENAS:
@@ -313,17 +328,18 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
         judge.scene, data, pose.astype(float), box.astype(float)
     )
     found = np.array(_distances(pose, box, xp))
-    # Rays that meet something, and rays that start inside something.
+    # Enough rays meet something, and enough rays start inside something.
     assert (seen_by_mujoco < RANGE).sum() > 1000
     assert (seen_by_mujoco == 0.0).sum() > 100
     # Float32 rounds positions of up to 0.4 m to 3e-8 m, in JAX and in the walls' quaternions that
-    # MuJoCo gets; a slanted face stretches that some times. A ray that grazes an edge would tell
-    # the two apart by more, up to its whole length: none of these 8,000 comes so close to one.
+    # MuJoCo gets. A slanted face multiplies this error several times. The two distances of a ray
+    # that grazes an edge could differ by its whole length, but none of these 8,000 rays is so close
+    # to an edge.
     np.testing.assert_allclose(found, seen_by_mujoco, rtol=0, atol=5e-7)
 
 
 def _distances(pose: np.ndarray, box: np.ndarray, xp: ModuleType) -> Any:
-    """Reads the analytic sensors of many arenas: JAX in float32, NumPy in double."""
+    """Returns the analytic distances of many arenas, by JAX in float32 or by NumPy in float64."""
     if xp is jnp:
         one = functools.partial(
             infrared.distances, side=_f32(SIDE)[0], hull_radius=RADIUS, limit=RANGE, xp=jnp
@@ -336,12 +352,12 @@ def _distances(pose: np.ndarray, box: np.ndarray, xp: ModuleType) -> Any:
 
 
 ARENA = 0.5  # m
-MANY = 2000  # arenas, of `ROBOTS` robots each: 10,000 poses, 80,000 rays
+MANY = 2000  # arenas of `ROBOTS` robots each, which makes 10,000 poses and 80,000 rays
 HALVES = ((13 / 256, 5 / 256), (1 / 32, 5 / 64))  # m; exact in float32
 
 
 class _World:
-    """A square arena of MuJoCo's own, with cylinders and boxes that are put where they should."""
+    """A square arena in MuJoCo, with cylinders and boxes that `put` moves."""
 
     def __init__(self, cylinders: list[float], boxes: tuple[tuple[float, float], ...]) -> None:
         spec = mujoco.MjSpec()
@@ -359,7 +375,7 @@ class _World:
         spec.worldbody.add_body(mocap=True).add_geom(type=kind, size=size)
 
     def put(self, pose: np.ndarray, side: float) -> None:
-        """Puts the things at poses [N, 3] and the walls about an arena."""
+        """Moves the cylinders and boxes to poses [N, 3], and the walls to the sides of an arena."""
         quarter = np.arange(4) * math.pi / 2
         away = 0.5 * side + 0.5
         walls = np.stack([away * np.cos(quarter), away * np.sin(quarter), quarter], axis=-1)
@@ -375,7 +391,7 @@ class _World:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Casts rays [N, 2] that ignore geom `me` [N]; returns distances and geoms (-1: none).
 
-        A ray from inside is told by where its start lies in the geom's own frame.
+        The distance is 0 if the ray starts inside a geom, which is checked in the geom's own frame.
         """
         flat = np.zeros((len(origin), 1))
         origin = np.concatenate([origin, flat], axis=-1)
@@ -392,7 +408,7 @@ class _World:
         return np.where(inside.any(axis=-1), 0.0, reach), geom
 
     def _inside(self, point: np.ndarray) -> np.ndarray:
-        """Tells [N, G] whether points [N, 3] are inside geoms."""
+        """Returns whether each point [N, 3] is inside each geom, [N, G]."""
         offset = point[:, None] - self.data.geom_xpos
         local = np.einsum("gij,ngi->ngj", self.data.geom_xmat.reshape(-1, 3, 3), offset)
         size = self.model.geom_size
@@ -403,9 +419,10 @@ class _World:
 
 @functools.cache
 def _many_scenes() -> tuple[np.ndarray, ...]:
-    """Draws poses and boxes; returns them with what MuJoCo sees and on which geom, [A, R, K].
+    """Draws poses and boxes; returns them with MuJoCo's distances and the geoms hit, [A, R, K].
 
-    They lie anywhere, so that things overlap and many a sensor is inside one.
+    Robots and boxes lie anywhere in the arena, so that they overlap and many sensors are inside a
+    geom.
     """
     draw = np.random.default_rng(1)
     pose = draw.uniform([-0.27, -0.27, -9.0], [0.27, 0.27, 9.0], (MANY, ROBOTS, 3))
@@ -427,10 +444,10 @@ def _many_scenes() -> tuple[np.ndarray, ...]:
 def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> None:
     pose, box, truth, geom = _many_scenes()
     hits = (truth > 0.0) & (truth < RANGE)
-    assert (truth == 0.0).sum() > 10_000  # they start inside something
+    assert (truth == 0.0).sum() > 10_000  # these rays start inside a geom
     assert hits.sum() > 10_000
     kind = xp.float32 if xp is jnp else float
-    # One shade a geom, in MuJoCo's order: the robots, the boxes, four times the wall.
+    # One reflectance for each geom, in MuJoCo's order: the robots, the boxes and the four walls.
     shade = np.array([0.30, 0.31, 0.32, 0.33, 0.34, 0.60, 0.61, *[0.9] * 4])
     reflectance = infrared.Reflectance(
         wall=xp.full(MANY, shade[-1], kind),
@@ -440,30 +457,31 @@ def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> Non
     side = xp.full(MANY, ARENA, kind)
     pose, box = xp.array(pose, kind), xp.array(box, kind)
     distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, None, xp)
-    # Float32 rounds positions of up to 0.5 m to 3e-8 m, and a slanted face or a chord of a hull
-    # stretches that some times: 3.0e-7 m at most here. In double 1.3e-8 m are left: the sensors'
-    # poses are constants of float32, so that directions are 6e-8 longer or shorter than 1, which
-    # MuJoCo allows for and a chord stretches.
+    # Float32 rounds positions of up to 0.5 m to 3e-8 m. A slanted face or a chord of a hull
+    # multiplies this error several times, here to 3.0e-7 m at most. In float64 an error of 1.3e-8 m
+    # remains: the sensors' poses are float32 constants, so directions are longer or shorter than 1
+    # by 6e-8. MuJoCo corrects for the length of a direction, and a chord multiplies the error.
     tolerance = 5e-7 if xp is jnp else 3e-8
     np.testing.assert_allclose(distance, truth, rtol=0, atol=tolerance)
     np.testing.assert_allclose(np.asarray(bright)[hits], shade[geom[hits]], atol=ROUNDING)
 
 
-GRAZES = 5000  # rays of each of two sorts
-# m; ten times what float32 rounds positions of up to 0.5 m by. A distance counts as right if a
-# sensor within that of where it is would report it: at an edge that a ray grazes, whether it meets
-# the edge is a matter of the last bit, and so it is whether a sensor on a surface is inside.
+GRAZES = 5000  # Rays of each of the two kinds in `_edge_rays`.
+# Ten times the rounding of float32, in m, for positions of up to 0.5 m. A distance counts as right
+# if it lies between the distances of sensors moved by this much. Rounding of the last bit decides
+# whether a grazing ray meets an edge, and whether a sensor on a surface is inside.
 NUDGE = 3e-7
 NUDGES = ((0, 0), (0, 1), (0, -1), (1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1))
 DISC, BOX = (0.05, -0.03, 0.06), (0.05, -0.03, 0.4, *HALVES[0])
 
 
 def _edge_rays(shape: str) -> tuple[np.ndarray, np.ndarray]:
-    """Draws origins and directions [N, 2], doubles, of rays that are hard to tell about a shape.
+    """Draws origins and directions [N, 2] in float64 of rays at the edge of a shape.
 
-    Half of them pass a tangent point of a disc, a corner of a box, or along a wall, by 1e-9 to
-    1e-2 m, from before or behind it; half start there, inside or outside by as much, and look
-    anywhere.
+    Each ray has a point on the shape: a tangent point of a disc, a corner of a box or a point of a
+    wall. The first half of the rays pass this point at a distance of 1e-9 to 1e-2 m, and start
+    before or behind it. The other rays start at a distance of 1e-9 to 1e-2 m from the point, inside
+    or outside the shape, and look in any direction.
     """
     draw = np.random.default_rng(2)
     count = 2 * GRAZES
@@ -476,7 +494,8 @@ def _edge_rays(shape: str) -> tuple[np.ndarray, np.ndarray]:
         outward = draw.uniform(-math.pi, math.pi, count)
         point = np.array(DISC[:2]) + DISC[2] * _toward(outward)
     else:
-        # Rays across these directions of a corner pass it, with 0.3 rad or more to either face.
+        # A ray perpendicular to one of these directions passes the corner at an angle of 0.3 rad or
+        # more to either face.
         outward = BOX[2] + draw.uniform(0.3, 0.5 * math.pi - 0.3, count)
         point = (
             np.array(BOX[:2]) + _toward(BOX[2]) * BOX[3] + _toward(BOX[2] + math.pi / 2) * BOX[4]
@@ -495,7 +514,7 @@ def _toward(yaw: Any) -> np.ndarray:
 
 @functools.cache
 def _seen_of_edges(shape: str) -> np.ndarray:
-    """Returns what MuJoCo sees along the rays of `_edge_rays`, from there and nearby, [9, N]."""
+    """Returns MuJoCo's distances [9, N] along the rays of `_edge_rays` and their nudged copies."""
     world = _World([DISC[2]] if shape == "disc" else [], HALVES[:1] if shape == "box" else ())
     thing = {"wall": np.zeros((0, 3)), "disc": [(*DISC[:2], 0.0)], "box": [BOX[:3]]}[shape]
     world.put(np.array(thing), ARENA)
@@ -527,9 +546,10 @@ def test_rays_that_graze_and_rays_that_start_at_a_surface(xp: ModuleType, shape:
         assert ((grazing[0] > 0.0) & (grazing[0] < RANGE)).sum() > 1000
     found = np.clip(np.asarray(found), 0.0, RANGE)
     if xp is np:
-        # The wall's tilt of 1e-6 rad or more stretches a rounding of 0.25 m, 3e-17 m, to 5.1e-11.
+        # A tilt of 1e-6 rad against the wall multiplies the rounding of 0.25 m, 3e-17 m, to
+        # 5.1e-11 m at most.
         np.testing.assert_allclose(found, truth[0], rtol=0, atol=1e-10)
-    # What a ray between two nudged ones meets lies between what those meet; 1e-7 m are the
-    # roundings of the distance itself.
+    # The distance of a ray between two nudged rays lies between the distances of these two. 1e-7 m
+    # is the rounding of the distance itself.
     assert (found >= truth.min(axis=0) - 1e-7).all()
     assert (found <= truth.max(axis=0) + 1e-7).all()

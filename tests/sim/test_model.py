@@ -1,4 +1,4 @@
-"""The compiled model: what the ids point at, what may touch what, where things are put."""
+"""Tests the compiled model: its ids, its contact pairs and the places of walls and obstacles."""
 
 from typing import Literal
 
@@ -39,11 +39,13 @@ def test_bodies_and_geoms_of_either_description(
 ) -> None:
     built = model.build(RobotConfig(body=body), SIZE, STEP, fixtures=fixtures).compile()
     ids = model.ids(built, SIZE)
-    # The world, and a body for each planar robot, three for a wheeled one; six mocap bodies.
+    # The world is one body. A planar robot has one body, and a wheeled robot three. Obstacles and
+    # walls are six mocap bodies.
     robots = 3 if body == "planar" else 9
     assert built.nbody == 1 + robots + (6 if fixtures == "mocap" else 0)
     assert built.nmocap == (6 if fixtures == "mocap" else 0)
-    # Three servos of a planar robot, which MJX is told the forces of; a wheeled one has two motors.
+    # A planar robot has three servos, except in the description for MJX, which gets their forces
+    # instead. A wheeled robot has two motors in both descriptions.
     assert (built.nu, built.nsite) == {
         ("planar", "mocap"): (9, 3), ("planar", "world"): (0, 0),
         ("wheeled", "mocap"): (6, 0), ("wheeled", "world"): (6, 0),
@@ -51,7 +53,7 @@ def test_bodies_and_geoms_of_either_description(
     assert ids.robots.actuators.shape == (3, built.nu // 3)
     names = ["obstacle0", "obstacle1", "wall0", "wall1", "wall2", "wall3"]
     assert [built.geom(int(g)).name for g in ids.fixture_geom] == [f"{n}_box" for n in names]
-    np.testing.assert_array_equal(np.diff(ids.fixture_geom), 1)  # MJX replaces them in one piece
+    np.testing.assert_array_equal(np.diff(ids.fixture_geom), 1)  # MJX replaces these as a slice
     np.testing.assert_array_equal(ids.obstacle_geom, ids.fixture_geom[:2])
     expected = np.arange(6) if fixtures == "mocap" else np.full(6, -1)
     np.testing.assert_array_equal(ids.fixture_mocap, expected)
@@ -66,15 +68,15 @@ def test_only_what_acts_on_nothing_is_switched_off(body: Literal["planar", "whee
     assert flags & ~int(off.mjDSBL_GRAVITY) == expected
     for field in ("jnt_stiffness", "dof_damping", "dof_frictionloss", "body_gravcomp"):
         assert not getattr(built, field).any(), field
-    # MuJoCo leaves the drag of a fluid out with springs and dampers.
+    # MuJoCo leaves out the drag of a fluid as well if springs and dampers are switched off.
     assert built.opt.density == built.opt.viscosity == 0.0
-    # What gravity does to the joints of robots at rest.
+    # Gravity must be on only where it acts on the joints of robots at rest.
     built.opt.disableflags &= ~int(off.mjDSBL_GRAVITY)
     data = mujoco.MjData(built)
     pose = np.array([[0.0, 0.1, 0.3], [0.4, 0.0, -2.0], [-0.3, 0.2, 1.0]])
     data.qpos = model.BODIES[body].qpos(pose, np)
     mujoco.mj_forward(built, data)
-    weighed = bool(data.qfrc_bias.any())  # exactly; at rest there is no other bias
+    weighed = bool(data.qfrc_bias.any())  # exact, since at rest there is no other bias
     assert weighed == (body == "wheeled")
     assert weighed != bool(flags & int(off.mjDSBL_GRAVITY))
 
@@ -90,7 +92,8 @@ def test_sizes(size: ArenaSize) -> None:
 
 
 def test_only_hulls_touch(compiled: mujoco.MjModel) -> None:
-    # Nothing collides by type; the pairs are all of hull-hull (3), hull-obstacle and hull-wall.
+    # No geoms collide by type. The explicit pairs are all hull-hull pairs (3), hull-obstacle pairs
+    # and hull-wall pairs.
     assert not compiled.geom_contype.any()
     assert not compiled.geom_conaffinity.any()
     pairs = {
@@ -125,22 +128,24 @@ def test_robot_has_the_numbers_of_the_config() -> None:
     assert body.mass[0] == 0.2
     assert body.inertia[2] == 3e-4
     assert built.geom("robot1_hull").size[0] == 0.04
-    # Coulomb: 0.5 * 0.2 kg * 9.81 = 0.981 N along either axis, times 0.03 m as a torque.
+    # Coulomb friction limits the force to 0.5 * 0.2 kg * 9.81 = 0.981 N along either axis, and the
+    # torque to this force times 0.03 m.
     limits = built.actuator_forcerange[3:6, 1]
     np.testing.assert_allclose(limits, [0.981, 0.981, 0.981 * 0.03], rtol=1e-12)
     np.testing.assert_array_equal(built.actuator_forcerange[:, 0], -built.actuator_forcerange[:, 1])
-    # Deadbeat: inertia / step.
+    # A deadbeat servo has the gain inertia / step.
     gains = built.actuator_gainprm[3:6, 0]
     np.testing.assert_allclose(gains, [0.2 / STEP, 0.2 / STEP, 3e-4 / STEP], rtol=1e-12)
 
 
 def test_servos_lag_along_what_the_motors_drive() -> None:
     built = model.build(RobotConfig(motor_lag=0.1), SIZE, STEP).compile()
-    # 0.32 time constants a step: 1 - exp(-0.32) = 0.273851 of the way; sideways there is no motor.
+    # A step is 0.32 time constants, so a lagging servo closes 1 - exp(-0.32) = 0.273851 of the
+    # difference. Sideways there is no motor, so nothing lags.
     robot, share = RobotConfig(), np.array([0.273851, 1.0, 0.273851])
     inertia = np.array([robot.mass, robot.mass, robot.yaw_inertia])
     gains = built.actuator_gainprm[3:6, 0]
-    np.testing.assert_allclose(gains, share * inertia / STEP, rtol=1e-6)  # digits of the share
+    np.testing.assert_allclose(gains, share * inertia / STEP, rtol=1e-6)  # the share's digits
 
 
 def test_a_ray_sees_the_hull_as_the_webots_cylinder() -> None:
@@ -150,7 +155,7 @@ def test_a_ray_sees_the_hull_as_the_webots_cylinder() -> None:
     assert geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER
     radius, half = geom.size[0], geom.size[1]
     assert radius == 0.037
-    # 1e-12 m: rounding of float64; z from 0.0025 to 0.0475 m.
+    # The cylinder's z goes from 0.0025 to 0.0475 m. 1e-12 m is the rounding of float64.
     assert geom.pos[2] - half == pytest.approx(0.0025, abs=1e-12)
     assert geom.pos[2] + half == pytest.approx(0.0475, abs=1e-12)
     assert geom.pos[2] - half < epuck.SENSOR_HEIGHT < geom.pos[2] + half
@@ -172,13 +177,14 @@ def test_fixtures_stand_where_the_level_says(compiled: mujoco.MjModel) -> None:
         box = data.geom(f"obstacle{i}_box")
         np.testing.assert_allclose(box.xpos[:2], [x, y], atol=1e-12)  # rounding of float64
         expected = [np.cos(yaw), np.sin(yaw)]
-        np.testing.assert_allclose(box.xmat.reshape(3, 3)[:2, 0], expected, atol=1e-12)  # likewise
+        np.testing.assert_allclose(box.xmat.reshape(3, 3)[:2, 0], expected, atol=1e-12)  # as above
     for i, outward in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
         box, half = data.geom(f"wall{i}_box"), compiled.geom(f"wall{i}_box").size
         extent = np.abs(box.xmat.reshape(3, 3)[:2]) @ half
-        # The inner face is half a side away; 1e-6 m: bearings of float32, at 2.5 m.
+        # The inner face is half a side from the centre. 1e-6 m is the rounding of a float32 bearing
+        # at 2.5 m.
         assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-6)
-        # Along the wall it is longer than the largest arena, 4 m.
+        # The wall is at least as long as the largest arena's side, 4 m.
         assert (extent * (1 - np.abs(outward))).sum() >= 2.0
 
 

@@ -1,4 +1,4 @@
-"""Commands on their way to the wheels, step by step by hand, and speeds against the firmware."""
+"""Tests latency and stalls of commands step by step by hand, and speeds against the firmware."""
 
 import math
 from typing import Any
@@ -29,7 +29,7 @@ def _run(
     xp: Any = np,
     seed: Any = SEED,
 ) -> tuple[np.ndarray, list[Motor | None]]:
-    """Delivers commands [T, R, 2]; returns what arrived, [T, R, 2], and the states."""
+    """Delivers commands [T, R, 2]; returns the commands that arrived, [T, R, 2], and the states."""
     state = motor.init(realism, commands.shape[1], xp)
     late = None if latency is None else xp.asarray(latency)
     arrived, states = [], [state]
@@ -43,13 +43,13 @@ def _run(
 
 
 def _numbered(steps: int, robots: int) -> np.ndarray:
-    """Commands that tell control step and robot: (step + 1, -(robot + 1)), [T, R, 2]."""
+    """Returns commands [T, R, 2] that encode control step and robot: (step + 1, -(robot + 1))."""
     first, second = np.meshgrid(np.arange(1, steps + 1), -np.arange(1, robots + 1), indexing="ij")
     return np.stack([first, second], axis=-1).astype(np.float32)
 
 
 def _stall_begins(seed: Any, clock: int, robots: int, realism: RealismConfig) -> np.ndarray:
-    """Whether a stall would begin, [R]: the numbers that `deliver` says it draws."""
+    """Returns whether a stall would begin, [R], from the numbers that `deliver` documents."""
     drawn = noise.uniform(seed, clock, Stream.STALL, (robots,), np)
     return drawn < np.float32(realism.stall)
 
@@ -60,7 +60,8 @@ def _stall_begins(seed: Any, clock: int, robots: int, realism: RealismConfig) ->
 def test_a_command_arrives_after_its_latency() -> None:
     commands = _numbered(6, 3)
     arrived, states = _run(LATE, commands, np.array([0, 1, 2], np.int32))
-    # Robots of latency 0, 1 and 2; before the first command all were zero.
+    # The robots have latencies of 0, 1 and 2 control steps. Before the first command arrives, the
+    # command is zero.
     np.testing.assert_array_equal(arrived[:, 0, 0], [1, 2, 3, 4, 5, 6])
     np.testing.assert_array_equal(arrived[:, 1, 0], [0, 1, 2, 3, 4, 5])
     np.testing.assert_array_equal(arrived[:, 2, 0], [0, 0, 1, 2, 3, 4])
@@ -92,7 +93,8 @@ def test_without_latency_and_stalls_commands_pass_untouched() -> None:
     commands = _numbered(2, 3)
     assert _run(IDEAL, commands)[1] == [None] * 3
     np.testing.assert_array_equal(_run(IDEAL, commands)[0], commands)
-    # Nor does a robot of latency 0 notice that others wait, or that a stall might have been.
+    # A latency of up to 2 for other robots and a stall probability of 0 do not change the commands
+    # of robots with latency 0.
     quiet = RealismConfig(action_latency=(0, 2), stall=0.0)
     np.testing.assert_array_equal(_run(quiet, commands, np.zeros(3, np.int32))[0], commands)
 
@@ -117,7 +119,7 @@ def test_a_stall_holds_the_last_delivered_command() -> None:
             else:
                 last = t + 1.0
             expected[t, robot] = last
-    assert begun > 10  # else the seed shows little
+    assert begun > 10  # otherwise the seed tests little
     np.testing.assert_array_equal(arrived[..., 0], expected)
 
 
@@ -131,7 +133,7 @@ def test_a_stall_that_runs_is_left_alone_and_ends_on_time() -> None:
         assert state is not None
         assert state.held is not None
         found.append([*now[:, 0], *state.held])
-    # Robot 0 and 1, and their control steps left.
+    # Each row holds the commands of robots 0 and 1, and the control steps left of their stalls.
     assert found == [[7, 1, 2, 0], [7, 2, 1, 0], [7, 3, 0, 0], [4, 4, 0, 0], [5, 5, 0, 0]]
 
 
@@ -150,15 +152,16 @@ def test_stalls_begin_as_often_and_last_as_long_as_asked() -> None:
     state, now = motor.deliver(state, command, None, realism, seeds, 6, STEP, np)
     begun = now[..., 0] == 0.0
     assert state is not None
-    # Deviation of a mean of 200,000: sqrt(0.02 * 0.98 / 2e5); 4.42 of them, probability 1e-5.
+    # The mean of 200,000 draws has a standard deviation of sqrt(0.02 * 0.98 / 2e5). It is off by
+    # more than 4.42 deviations with probability 1e-5.
     assert abs(begun.mean() - 0.02) < 4.42 * math.sqrt(0.02 * 0.98 / 2e5)
-    # 0.1 to 0.3 s are 3.125 to 9.375 control steps: rounded, 3 with a share of 0.375 / 6.25, 4 to
-    # 8 with 1 / 6.25 each, and 9 with 0.875 / 6.25.
+    # Stalls of 0.1 to 0.3 s last 3.125 to 9.375 control steps. After rounding, the share of stalls
+    # is 0.375 / 6.25 for 3 steps, 1 / 6.25 for each number from 4 to 8, and 0.875 / 6.25 for 9.
     counts = np.bincount(np.asarray(state.held)[begun] + 1, minlength=10)[3:]
     share = np.array([0.375, 1, 1, 1, 1, 1, 0.875]) / 6.25
     assert counts.sum() == begun.sum()
     deviation = np.sqrt(share * (1 - share) * counts.sum())
-    assert (np.abs(counts - share * counts.sum()) < 4.42 * deviation).all(), counts  # likewise
+    assert (np.abs(counts - share * counts.sum()) < 4.42 * deviation).all(), counts  # as above
 
 
 def test_after_a_stall_the_newest_command_that_is_due_counts() -> None:
@@ -169,7 +172,7 @@ def test_after_a_stall_the_newest_command_that_is_due_counts() -> None:
     alone, _ = _run(RealismConfig(stall=0.15, stall_time=(0.064, 0.064)), _numbered(40, 3))
     fresh = alone[..., 0] == np.arange(1, 41)[:, None]  # where no stall runs
     assert 10 < (~fresh).sum() < 80
-    # A stall acts on what is due, as if it were sent just then.
+    # A stall acts on the command that is due, as if that command were sent in this step.
     expected = late[..., 0].copy()
     for t in range(40):
         before = expected[t - 1] if t else np.zeros(3)
@@ -220,7 +223,7 @@ def test_numpy_with_leading_axes_and_mapped_jax_deliver_alike(name: str) -> None
             lambda leaf: leaf.dtype, first
         )
         waited = waited or bool((expected != command).any())
-    assert waited  # else nothing was late
+    assert waited  # otherwise no command was late
 
 
 @pytest.mark.parametrize("version", ["epuck1", "epuck2", None])
@@ -238,7 +241,7 @@ def test_numpy_with_leading_axes_and_mapped_jax_disturb_alike(
     expected = motor.disturb(wheels, realism, seeds, 4, np)
     found = jax.jit(jax.vmap(arena, in_axes=(0, 0, None)))(wheels, seeds, jnp.int32(4))
     assert found.dtype == expected.dtype == np.float32
-    # 5e-6 rad/s: the normal numbers' 2e-6, times 0.05, and 10 ulp of a float32 at 8.
+    # 5e-6 rad/s covers the normal numbers' error of 2e-6 times 0.05, and 10 ulp of a float32 at 8.
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-6)
 
 
@@ -248,19 +251,21 @@ def test_numpy_with_leading_axes_and_mapped_jax_disturb_alike(
 @pytest.mark.parametrize(
     ("version", "asked", "made"),
     [
-        # 10000 / int(10000 / s): 10 and 11 and 12 and 16 ticks of 0.1 ms (facts, section 4.1).
+        # Version 1 makes 10000 / int(10000 / s) steps per second. A step here takes 10, 11, 12 or
+        # 16 ticks of 0.1 ms (facts, section 4.1).
         ("epuck1", 1000, 1000.0),
         ("epuck1", 950, 1000.0),
         ("epuck1", 900, 909.0909),
         ("epuck1", 800, 833.3333),
         ("epuck1", 600, 625.0),
-        # 100000 / (2 int(100000 / (2 s))): 50, 52, 83, 45 and 50000.
+        # Version 2 makes 100000 / (2 int(100000 / (2 s))) steps per second. The integer here is 50,
+        # 52, 83, 45 or 50000.
         ("epuck2", 1000, 1000.0),
         ("epuck2", 950, 961.5385),
         ("epuck2", 600, 602.4096),
         ("epuck2", 1100, 1111.1111),
         ("epuck2", 1, 1.0),
-        # The fraction of a step per second is cut off, and what is left below one.
+        # A fraction of a step per second is cut off, so 0.98 steps per second become 0.
         ("epuck1", 909.9, 909.0909),
         ("epuck2", 1.98, 1.0),
         ("epuck1", 0.98, 0.0),
@@ -272,12 +277,12 @@ def test_numpy_with_leading_axes_and_mapped_jax_disturb_alike(
     ],
 )
 def test_speeds_of_the_firmware(version: Any, asked: float, made: float) -> None:
-    # A thousandth of a step per second keeps whole numbers from rounding to the one below.
+    # A thousandth of a step per second keeps whole numbers from being rounded down by one.
     speed = np.array([asked + 1e-3, -asked - 1e-3]) * RATE
     for xp, kind in ((np, np.float64), (np, np.float32), (jnp, np.float32)):
         found = motor.quantise(xp.asarray(speed, kind), version, xp)
         assert found.dtype == kind
-        # 5e-7: half of the table's last digit, and three roundings of float32.
+        # 5e-7 covers half of the table's last digit and three roundings of float32.
         np.testing.assert_allclose(np.asarray(found) / RATE, [made, -made], rtol=5e-7)
 
 
@@ -292,7 +297,8 @@ def test_the_wheel_makes_the_next_faster_speed_that_the_timer_has(
     if asked < 1.0 + 1e-6:
         return
     assert math.copysign(1.0, found) == math.copysign(1.0, speed)
-    # Less than one step per second is cut off, and less than one tick. 1e-6: float32.
+    # The firmware cuts off less than one step per second and less than one tick. 1e-6 is the
+    # rounding of float32.
     ticks = {"epuck1": 10_000, "epuck2": 50_000}[version]
     assert made * (1 + 1e-6) >= asked - 1.0
     assert ticks / made * (1 + 1e-6) > ticks / asked - 1.0
@@ -304,11 +310,12 @@ def test_speed_noise_is_relative_and_each_wheels_own() -> None:
     wheels = np.full((50_000, 1, 2), -4.0, np.float32)
     found = motor.disturb(wheels, realism, np.arange(50_000, dtype=np.uint32), 7, np)
     relative = (found / wheels - 1.0).astype(float)[:, 0]
-    # 4.42 deviations of a mean, of a standard deviation and of a correlation; probability 1e-5.
+    # The mean, the standard deviation and the correlation are each off by more than 4.42 of their
+    # deviations with probability 1e-5.
     assert np.abs(relative.mean(axis=0)).max() < 4.42 * 0.05 / math.sqrt(50_000)
     assert np.abs(relative.std(axis=0) - 0.05).max() < 4.42 * 0.05 / math.sqrt(2 * 50_000)
     assert abs(np.corrcoef(relative.T)[0, 1]) < 4.42 / math.sqrt(50_000)
-    # Fresh at each control step.
+    # Each control step draws new noise.
     later = motor.disturb(wheels, realism, np.arange(50_000, dtype=np.uint32), 8, np)
     both = np.stack([found[:, 0, 0], later[:, 0, 0]])
     assert abs(np.corrcoef(both)[0, 1]) < 4.42 / math.sqrt(50_000)
@@ -316,10 +323,10 @@ def test_speed_noise_is_relative_and_each_wheels_own() -> None:
 
 def test_the_noise_comes_on_top_of_what_the_firmware_makes() -> None:
     realism = RealismConfig(speed_noise=0.05, speed_quantisation="epuck1")
-    wheels = np.full((4, 2), 950.5 * RATE)  # run at 1000 steps per second
+    wheels = np.full((4, 2), 950.5 * RATE)  # the firmware makes it 1000 steps per second
     noisy = motor.disturb(wheels, realism, SEED, 0, np)
     drawn = noise.normal(SEED, 0, Stream.SPEED_NOISE, (4, 2), np)
-    # 1e-6: float32's digits of 6.3 rad/s.
+    # 1e-6 covers the rounding of float32 at 6.3 rad/s.
     np.testing.assert_allclose(noisy, 1000 * RATE * (1 + 0.05 * drawn), rtol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The random numbers: against plain whole numbers, the same in both modules, and fair."""
+"""Tests the random numbers: an integer reference, NumPy against JAX, and fairness."""
 
 import math
 
@@ -17,18 +17,19 @@ COUNT = 100_000
 WORD = 2**32
 SEED = st.integers(0, WORD - 1)
 CLOCK = st.integers(0, 2**31 - 1)
-# log, cos and sin of NumPy and XLA differ by an ulp or two, and the radius is 5.8 at most.
+# NumPy and XLA differ by an ulp or two in log, cos and sin. The Box-Muller radius is at most 5.8.
 ULPS = 2e-6
-# Two-sided probability 1e-5 of a standard normal number: a fair generator fails so rarely.
+# A standard normal number is farther than 4.42 from 0 with probability 1e-5, so a fair generator
+# rarely fails.
 FAR = 4.42
 
-# Numbers that run along one of what they are hashed from: seeds, clocks, indices, and streams,
-# which are plain ints, so that there are as many calls.
+# Each layout draws its numbers along one input of the hash: seed, clock, index or stream. A stream
+# is a plain int, so the layout "stream" needs one call for each stream.
 LAYOUTS = ["seed", "clock", "index", "stream"]
 
 
 def _drawn(kind: str, layout: str) -> np.ndarray:
-    """Returns [COUNT] uniform or normal numbers along one axis, the others fixed."""
+    """Returns [COUNT] uniform or normal numbers, drawn along one of `LAYOUTS`."""
     draw = getattr(noise, kind)
     run = np.arange(COUNT, dtype=np.uint32)
     if layout == "seed":
@@ -45,7 +46,7 @@ def _drawn(kind: str, layout: str) -> np.ndarray:
 
 
 def _mix(word: int) -> int:
-    """`triple32inc`, in whole numbers without end."""
+    """Hashes a word with `triple32inc`, in Python's integers of unlimited size."""
     word = (word + 1) % WORD
     word = (word ^ word >> 17) * 0xED5AD4BB % WORD
     word = (word ^ word >> 11) * 0xAC4C1B51 % WORD
@@ -66,7 +67,7 @@ def test_bits_are_the_hash_of_seed_clock_stream_and_index(
 
 
 def test_streams_differ() -> None:
-    assert len(Stream) == len(Stream.__members__)  # two of one value count as one stream
+    assert len(Stream) == len(Stream.__members__)  # len(Stream) counts equal values once
     found = {int(noise.bits(np.uint32(1), 0, stream, (), np)) for stream in Stream}
     assert len(found) == len(Stream)
 
@@ -91,14 +92,14 @@ def test_normal_is_box_and_muller() -> None:
 
 
 def test_ends_of_the_range() -> None:
-    # Found by search: these seeds' upper 24 bits are all 0, and all 1.
+    # Found by search: the upper 24 bits are all 0 for the first seed and all 1 for the second.
     seeds = np.array([36119314, 1173731], np.uint32)
     np.testing.assert_array_equal(
         noise.uniform(seeds, 0, 0, (), np), np.array([0, 1 - 2**-24], np.float32)
     )
     pairs = noise.normal(seeds, 0, 0, (2,), np)
     np.testing.assert_array_equal(pairs[0], 0.0)
-    # sqrt(2 * 24 * log(2)); 1e-6 is 2 ulp there.
+    # The largest radius is sqrt(2 * 24 * log(2)), where 1e-6 is 2 ulp.
     assert math.hypot(*pairs[1]) == pytest.approx(5.768108, abs=1e-6)
 
 
@@ -132,7 +133,8 @@ def test_leading_axes_are_single_draws(kind: str) -> None:
     clocks = 10 * seeds.astype(np.int32)
     both = draw(seeds, clocks, Stream.STALL, (5,), np)
     common = draw(seeds, 7, Stream.STALL, (5,), np)
-    # 0: whole numbers. SIMD and scalar paths of NumPy's log and cos may differ in the last bits.
+    # Bits and uniform numbers agree exactly. NumPy's SIMD and scalar code for log and cos may
+    # differ in the last bits.
     tolerance = ULPS if kind == "normal" else 0
     for place in np.ndindex(2, 3):
         one = draw(seeds[place], int(clocks[place]), Stream.STALL, (5,), np)
@@ -158,8 +160,9 @@ def test_uniform_numbers_are_even(layout: str) -> None:
     assert found.min() >= 0.0
     assert found.max() < 1.0
     counts = np.histogram(found, bins=1000, range=(0.0, 1.0))[0]
-    assert stats.chisquare(counts).pvalue > 1e-5  # a fair generator fails so rarely
-    # The mean's deviation is sqrt(1/12/n), that of the squared distance from 1/2 sqrt(1/180/n).
+    assert stats.chisquare(counts).pvalue > 1e-5  # A fair generator fails in 1 of 1e5 runs.
+    # The mean has a standard deviation of sqrt(1/12/n). The mean squared distance from 1/2 has a
+    # standard deviation of sqrt(1/180/n).
     assert abs(found.mean() - 0.5) < FAR * math.sqrt(1 / 12 / COUNT)
     assert abs(((found - 0.5) ** 2).mean() - 1 / 12) < FAR * math.sqrt(1 / 180 / COUNT)
 
@@ -167,10 +170,10 @@ def test_uniform_numbers_are_even(layout: str) -> None:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_normal_numbers_are_normal(layout: str) -> None:
     found = _drawn("normal", layout).astype(float)
-    # Deviations of the means of z, z**2, z**3 and z**4: sqrt of 1, 2, 15 and 96 over n.
+    # The means of z, z**2, z**3 and z**4 have the variances 1/n, 2/n, 15/n and 96/n.
     for power, (mean, variance) in enumerate([(0, 1), (1, 2), (0, 15), (3, 96)], start=1):
         assert abs((found**power).mean() - mean) < FAR * math.sqrt(variance / COUNT), power
-    assert stats.kstest(found, "norm").pvalue > 1e-5  # a fair generator fails so rarely
+    assert stats.kstest(found, "norm").pvalue > 1e-5  # A fair generator fails in 1 of 1e5 runs.
 
 
 @pytest.mark.parametrize("kind", ["uniform", "normal"])
@@ -180,19 +183,19 @@ def test_neighbours_know_nothing_of_each_other(kind: str, layout: str) -> None:
     place = stats.norm.cdf(found) if kind == "normal" else found
     for lag in (1, 2, 3, 8, 16, 40, 1024):
         first, second = place[:-lag], place[lag:]
-        # The correlation of n independent pairs deviates by 1 / sqrt(n).
+        # The correlation of n independent pairs has a standard deviation of 1 / sqrt(n).
         correlation = np.corrcoef(first, second)[0, 1]
         assert abs(correlation) < FAR / math.sqrt(len(first)), (lag, correlation)
-        # Nor by any other rule: pairs fall evenly on the squares of a board. Half of the pairs
-        # share no number with another.
+        # Pairs must also fall evenly into 16 x 16 bins, which finds dependence beyond correlation.
+        # This takes only half of the pairs, none of which shares a number with another pair.
         apart = np.flatnonzero((np.arange(len(first)) // lag) % 2 == 0)
         counts = np.histogram2d(first[apart], second[apart], bins=16, range=[(0, 1), (0, 1)])[0]
-        assert stats.chisquare(counts.reshape(-1)).pvalue > 1e-5, lag  # likewise
+        assert stats.chisquare(counts.reshape(-1)).pvalue > 1e-5, lag  # as above
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_streams_clocks_and_seeds_know_nothing_of_each_other(layout: str) -> None:
-    # Two whole runs side by side, apart by one in what does not run along them.
+    # Draws many numbers twice, with a seed, clock, stream or index that differs by one.
     run = np.arange(COUNT, dtype=np.uint32)
     other = {
         "seed": lambda d: noise.uniform(run + np.uint32(d), 3, 4, (), np),
@@ -214,16 +217,16 @@ def test_each_bit_flips_half_of_the_bits(layout: str) -> None:
         else:
             change = noise.bits(run * 0, run, 0, (), np) ^ noise.bits(run * 0, turned, 0, (), np)
         share = np.unpackbits(change.view(np.uint8)).reshape(4096, 32).mean(axis=0)
-        # A share of 4096 fair bits deviates by 1/128; the worst of 1,984 of them passes 5.5
-        # deviations with probability 8e-5.
+        # The share of ones in 4096 fair bits has a standard deviation of 1/128. The worst of the
+        # 1,984 shares of both layouts exceeds 5.5 deviations with probability 8e-5.
         assert np.abs(share - 0.5).max() < 5.5 / 128, bit
 
 
 def test_runs_of_numbers_do_not_meet() -> None:
-    # 64 seeds, 64 clocks, 2 streams and 32 indices: 2**18 words, of which chance lets
-    # 2**36 / 2 / 2**32 = 8 pairs agree. Were a seed and a
-    # clock, or a clock and an index, only added, or to change places, thousands would agree.
+    # 64 seeds, 64 clocks, 2 streams and 32 indices give 2**18 words. By chance
+    # 2**36 / 2 / 2**32 = 8 pairs of words agree. Thousands of pairs would agree if the hash only
+    # added two of its inputs, such as seed and clock, or if two inputs could change places.
     seeds, clocks = np.meshgrid(np.arange(64, dtype=np.uint32), np.arange(64))
     words = np.stack([noise.bits(seeds, clocks, stream, (32,), np) for stream in (0, 1)])
     pairs = words.size - len(np.unique(words))
-    assert pairs < 30  # Poisson of 8: probability 2e-9
+    assert pairs < 30  # a Poisson number of mean 8 reaches 30 with probability 2e-9

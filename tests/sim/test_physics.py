@@ -1,4 +1,4 @@
-"""MJX, by both implementations and with both bodies, against MuJoCo C and against closed forms."""
+"""Tests MJX, by both implementations and with both bodies, against MuJoCo C and closed forms."""
 
 import dataclasses
 import functools
@@ -45,8 +45,8 @@ SIDE = 0.6  # m
 GRIP = 9.81  # m/s^2; friction 1
 
 
-# What compiles a program of its own, on wheels by `jax` half a minute each, is done by the others
-# alone unless slow proofs are asked for.
+# Some tests compile their own program. With wheeled robots by `jax` each such test takes half a
+# minute, so that engine runs these tests only with `-m slow`.
 ONCE_MORE = pytest.mark.parametrize(
     "engine",
     [
@@ -60,7 +60,8 @@ ONCE_MORE = pytest.mark.parametrize(
 
 @pytest.fixture(scope="module", params=ENGINES, ids="-".join)
 def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
-    # A program of Warp calls back into the process that compiled it: it is not for the disk.
+    # A program that uses Warp calls back into the process that compiled it, so it must not be
+    # cached on disk.
     seconds = jax.config.jax_persistent_cache_min_compile_time_secs
     if request.param[0] == "warp":
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
@@ -73,14 +74,14 @@ def _body(engine: Engine) -> str:
 
 
 def _in_c(engine: Engine, pose: np.ndarray, wheels: np.ndarray, obstacle: np.ndarray) -> Path:
-    """All arenas [A, R, 3] with wheels [T, A, R, 2] by MuJoCo C."""
+    """Drives all arenas [A, R, 3] in MuJoCo C with wheel speeds [T, A, R, 2]."""
     robot = engine.loaded.robot
     paths = [drive_in_c(robot, pose[a], wheels[:, a], obstacle, side=SIDE) for a in range(ARENAS)]
     return Path(*(np.concatenate(parts, axis=1) for parts in zip(*paths, strict=True)))
 
 
 def _random_wheels(seed: int, steps: int, hold: int) -> np.ndarray:
-    """Wheels of random commands, each held for some control steps: [T, A, R, 2]."""
+    """Returns wheel speeds [T, A, R, 2] of random commands, each held for `hold` control steps."""
     random = np.random.default_rng(seed)
     action = random.uniform(-1.0, 1.0, (steps // hold, ARENAS, ROBOTS, 2))
     robot = drive.from_config(RobotConfig())
@@ -89,7 +90,7 @@ def _random_wheels(seed: int, steps: int, hold: int) -> np.ndarray:
 
 
 def _yaws(seed: int, place: list[tuple[float, float]]) -> np.ndarray:
-    """Robots at these places in all arenas, each with a heading of its own: [A, R, 3]."""
+    """Returns poses [A, R, 3] at these places in every arena, with random headings."""
     pose = np.empty((ARENAS, ROBOTS, 3), np.float32)
     pose[..., :2] = place
     pose[..., 2] = np.random.default_rng(seed).uniform(-np.pi, np.pi, (ARENAS, ROBOTS))
@@ -97,12 +98,13 @@ def _yaws(seed: int, place: list[tuple[float, float]]) -> np.ndarray:
 
 
 def _check_close(found: Path, expected: Path) -> None:
-    """Places (m), headings (rad) and wheel speeds (rad/s) of all robots against MuJoCo C.
+    """Compares places (m), headings (rad) and wheel speeds (rad/s) of all robots with MuJoCo C.
 
-    Over 8 seeds float32 made of it, with jax and warp alike, at most: planar 6.4e-6 m and
-    6e-6 rad; wheeled 1.3e-5 m, 2.4e-4 rad and 6.1e-5 rad/s, in contact or in 200 control steps of
-    fresh random commands. Twice that, rounded up. In one episode of thirty or so a wheel lets go
-    in float32 a moment before it does in float64, and its robot goes on 1 to 5 mm beside.
+    Over 8 seeds the largest errors of float32, by `jax` and by `warp`, were 6.4e-6 m and 6e-6 rad
+    for planar robots, and 1.3e-5 m, 2.4e-4 rad and 6.1e-5 rad/s for wheeled robots. These errors
+    occurred in contact or in 200 control steps of fresh random commands. The bounds are twice these
+    errors, rounded up. In about one episode of thirty a wheel starts to slip in float32 a moment
+    before it does in float64, and its robot then drives 1 to 5 mm beside the path of MuJoCo C.
     """
     apart = np.abs(found.pose - expected.pose)
     apart[..., 2] = np.abs(turned(apart[..., 2]))
@@ -132,8 +134,8 @@ def test_random_commands_free_of_contact_as_in_c(engine: Engine) -> None:
 def test_contacts_as_in_c(engine: Engine) -> None:
     obstacle = np.array([[0.1, 0.02, 0.5, 0.06, 0.04], [-0.15, -0.12, 1.1, 0.05, 0.05]], np.float32)
     pose = _yaws(2, [(-0.03, -0.05), (0.05, 0.13), (0.0, -0.2)])
-    # Wheels that slip against what blocks their robot make its path chaotic, so the wheeled ones
-    # are told something else in every control step.
+    # A blocked robot whose wheels slip has a chaotic path, so wheeled robots get a new command in
+    # every control step.
     planar = _body(engine) == "planar"
     wheels = _random_wheels(6, 100, 10) if planar else _random_wheels(6, 50, 1)
     expected = _in_c(engine, pose, wheels, obstacle)
@@ -145,7 +147,7 @@ def test_contacts_as_in_c(engine: Engine) -> None:
     _check_close(found, expected)
 
 
-# Commands (m/s, rad/s) of the table of wheels in tests/sim/test_drive.py.
+# The commands (m/s, rad/s) of the table in tests/sim/test_drive.py.
 COMMANDS = [
     (0.0, 3.14),
     (0.0625, 3.14),
@@ -159,7 +161,7 @@ COMMANDS = [
 
 
 def _steady(path: Path, first: int) -> tuple[np.ndarray, np.ndarray]:
-    """Forward speed and turn rate [A] of robot 0 after the control step `first`."""
+    """Returns robot 0's mean forward speed and turn rate [A] after the control step `first`."""
     pose = path.pose[first:, :, 0]
     seconds = STEP * (len(pose) - 1)
     way = np.linalg.norm(np.diff(pose[..., :2], axis=0), axis=-1).sum(axis=0)
@@ -167,7 +169,7 @@ def _steady(path: Path, first: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _table() -> tuple[np.ndarray, np.ndarray]:
-    """Wheel speeds [8, 2] of the commands, and what v = 0.01 (L + R), w = (R - L) / 2.6 is."""
+    """Returns the commands' wheel speeds [8, 2], and v = 0.01 (L + R), w = (R - L) / 2.6."""
     wheels = drive.wheel_speeds(np.array(COMMANDS), drive.from_config(RobotConfig()), np)
     left, right = wheels.T
     return wheels, np.stack([0.01 * (left + right), (right - left) * 0.02 / 0.052], axis=-1)
@@ -175,8 +177,8 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 def _check_table(path: Path, expected: np.ndarray) -> None:
     speed, turn = _steady(path, 20)
-    # 1 %, and of what is 0: 1 % of the largest; a chord is shorter than its arc by (w dt)^2 / 24,
-    # 4e-4 at most.
+    # The tolerance is 1 % of each value, plus 1 % of the largest value for values of 0. A chord is
+    # shorter than its arc by a share of (w dt)^2 / 24, 4e-4 at most.
     np.testing.assert_allclose(speed, expected[:, 0], rtol=0.01, atol=0.01 * FULL)
     np.testing.assert_allclose(turn, expected[:, 1], rtol=0.01, atol=0.01 * 3.14)
 
@@ -197,16 +199,17 @@ def test_the_table_of_commands_in_c(body: str) -> None:
 
 
 def _unicycle(velocity: tuple[float, float], steps: int) -> np.ndarray:
-    """Poses [T, 3] after 1..T control steps of a smooth arc from the origin."""
+    """Returns poses [T, 3] after 1 to T control steps along a circular arc from the origin."""
     speed, rate = velocity
     time = STEP * np.arange(1, steps + 1)
-    # The chord of an arc of angle a is sinc(a / 2) of it, at half the angle.
+    # The chord of an arc of angle a has sinc(a / 2) of the arc's length and the direction a / 2.
     half = 0.5 * rate * time
     chord = speed * time * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(half), chord * np.sin(half), 2.0 * half], axis=-1)
 
 
-# Straight, both ways; on the spot, both ways; arcs, both ways; a clamped command; at rest.
+# Straight forwards and backwards; turns on the spot to either side; arcs to either side; a clamped
+# command; rest.
 MOTIONS = [
     (FULL, 0.0),
     (-0.06, 0.0),
@@ -220,20 +223,21 @@ MOTIONS = [
 
 
 def _check_unicycle(pose: np.ndarray, body: str) -> None:
-    """Poses [T, A, 3] against the unicycle, whose robot has its speed at once."""
+    """Compares poses [T, A, 3] with the unicycle model, which reaches its speed at once."""
     for arena, (speed, rate) in enumerate(MOTIONS):
         expected = _unicycle((speed, rate), len(pose))
         off = np.linalg.norm(pose[:, arena, :2] - expected[:, :2], axis=-1)
         turn = np.abs(turned(pose[:, arena, 2] - expected[:, 2]))
-        # Euler moves along the heading at the start of a step: half a step's angle of the way.
+        # Euler integration moves along the heading at the start of a step, so it is off by the
+        # distance driven times half the angle of a step.
         euler = np.abs(speed) * STEP * np.arange(1, len(pose) + 1) * 0.5 * abs(rate) * STEP
         if body == "planar":
-            assert np.all(off <= 1.01 * euler + 1e-5)  # 1e-5 m: float32, 60 steps
-            assert np.all(turn <= 1e-5)  # likewise
+            assert np.all(off <= 1.01 * euler + 1e-5)  # 1e-5 m: float32, 60 steps.
+            assert np.all(turn <= 1e-5)  # As above, in rad.
             continue
-        # The wheels' grip accelerates the robot as far as friction lets it: by 9.81 m/s^2 at most
-        # (6.1 with what the skid takes on), or 385 rad/s^2, and a physics step of 16 ms is lost
-        # before the floor is felt. 25 ms cover it; the slip of steady driving is below 0.1 %.
+        # Friction limits the robot's acceleration to 9.81 m/s^2 (6.1 with the share of weight on
+        # the skid) or 385 rad/s^2. A physics step of 16 ms is lost before the floor acts on the
+        # wheels. 25 ms cover both. The slip of steady driving is below 0.1 %.
         lost = 0.025 + 1e-3 * STEP * np.arange(1, len(pose) + 1)
         assert np.all(off <= 1.01 * euler + lost * (abs(speed) + 0.5 * abs(speed * rate)) + 1e-5)
         assert np.all(turn <= lost * abs(rate) + 2e-4)  # 2e-4 rad: wheels that start unevenly
@@ -255,7 +259,7 @@ def test_a_robot_moves_as_the_unicycle_in_c(body: str) -> None:
 
 
 def _speeds(path: Path, body: str) -> np.ndarray:
-    """Forward speed and turn rate [T, A, 2] of robot 0."""
+    """Returns the forward speed and turn rate [T, A, 2] of robot 0."""
     rate, yaw = path.rate[:, :, 0], path.pose[:, :, 0, 2]
     forward = rate[..., 0] * np.cos(yaw) + rate[..., 1] * np.sin(yaw)
     return np.stack([forward, rate[..., 2 if body == "planar" else 5]], axis=-1)
@@ -266,28 +270,29 @@ LAGGING = [*MOTIONS[:6], (0.03, 0.5), (0.0, 1.0)]
 
 
 def _check_lag(path: Path, robot: RobotConfig) -> None:
-    """Speeds against v (1 - exp(-t / lag))."""
+    """Compares speeds with v (1 - exp(-t / lag))."""
     done = 1.0 - np.exp(-STEP * np.arange(1, len(path.pose) + 1) / LAG)
     command = np.array(LAGGING)
     expected = done[:, None, None] * command
     if robot.body == "wheeled":
         wheels = path.rate[:, :, 0, 6:]
-        # 0.2 %: what the floor does to the wheels' speed, see sim/wheeled.py.
+        # The floor changes the wheels' speed by up to 0.2 %, see sim/wheeled.py.
         close = 2e-3 * np.abs(wheels_of(command)).max()
         np.testing.assert_allclose(wheels, wheels_of(expected), atol=close)
-    # Friction is far: 0.1256 m/s in 0.1 s takes 1.3 m/s^2 of 9.81. planar: a servo that lags also
-    # lags behind a body that turns, by (w dt)^2 / 2 a step: 5e-4 of the speed at 1 rad/s, and the
-    # lag adds three steps' up. wheeled: 1 % of the command, and a physics step (16 ms of 100)
-    # before the floor is felt.
+    # Friction is far from its limit: 0.1256 m/s in 0.1 s takes 1.3 of 9.81 m/s^2. A planar robot's
+    # lagging servo also lags behind a body that turns, by (w dt)^2 / 2 per step, which is 5e-4 of
+    # the speed at 1 rad/s, and the lag adds up three steps of this error. A wheeled robot may be
+    # off by 1 % of the command and by a physics step (16 of 100 ms) before the floor acts on it.
     tolerance = np.abs(command) * (0.01 + 0.16 * np.exp(-STEP / LAG)) + 1e-3
     tolerance = 2e-3 * np.abs(command) + 1e-5 if robot.body == "planar" else tolerance
     assert np.all(np.abs(_speeds(path, robot.body) - expected) <= tolerance)
 
 
 def _lagging(engine: Engine, robot: RobotConfig) -> tuple[Engine, Any]:
-    """What drives this robot, and its model: the lag is a number of the model's actuators.
+    """Returns an engine that drives this robot, and the engine's model.
 
-    Where servos are forces it is one of the program, which is compiled anew.
+    The lag is a number of the model's actuators. Where servos are forces, the lag is a constant of
+    the program, which is compiled again.
     """
     if _body(engine) == "planar":
         slower = load_as(dataclasses.replace(engine.config, robot=robot))
@@ -323,7 +328,7 @@ def test_a_lagging_servo_follows_the_closed_form_in_c(body: str) -> None:
 
 @ONCE_MORE
 def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
-    # Ten turns on the spot at 3.14 rad/s by the nominal track: 10 * 2 pi / 3.14 = 20.01 s.
+    # Ten turns on the spot at 3.14 rad/s take 10 * 2 pi / 3.14 = 20.01 s with the nominal track.
     steps, tracks = round(10 * 2 * np.pi / 3.14 / STEP), np.array([0.052, 0.057, 0.055])
     wheels = np.tile(wheels_of(np.array([0.0, 3.14])), (steps, 1))
     pose = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 5.0, 0.0]])
@@ -331,13 +336,14 @@ def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     path = drive_all(engine, pose, wheels, side=4.0, chassis=chassis)
     turns = turned(np.diff(path.pose[:, 0, :, 2], axis=0)).sum(axis=0) / (2.0 * np.pi)
     expected = 3.14 * STEP * (steps - 1) / (2.0 * np.pi) * 0.052 / tracks
-    # 0.1 % is the slip of steady driving; what is lost at the start is in the first step.
+    # The slip of steady driving is 0.1 %. The loss at the start lies in the first step, which is
+    # not counted.
     np.testing.assert_allclose(turns, expected, rtol=1e-3)
 
 
 @ONCE_MORE
 def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
-    """Mass, friction, wheels and track set at run time, against a model built with them."""
+    """Compares mass, friction, wheels and track set at run time with a model built with them."""
     robot = dataclasses.replace(
         engine.loaded.robot, friction=0.6, effective_track=0.056, wheel_radius=0.0198
     )
@@ -346,7 +352,7 @@ def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
         robot = dataclasses.replace(robot, mass=0.2, yaw_inertia=inertia)
     obstacle = np.array([[0.0, 0.0, 0.3, 0.05, 0.05], AWAY[1]], np.float32)
     built = compile_in_c(robot, obstacle, engine.loaded.substeps)
-    if _body(engine) == "wheeled":  # whose wheels grow heavier as well
+    if _body(engine) == "wheeled":  # the chassis makes its wheels heavier as well
         built.body_mass *= 0.2 / 0.16
         built.body_inertia *= 0.2 / 0.16
         mujoco.mj_setConst(built, mujoco.MjData(built))
@@ -370,19 +376,20 @@ def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
 
 @pytest.mark.parametrize("yaw", [0.0, 0.6, np.pi / 4])
 def test_a_robot_driven_into_a_wall_stays_inside(engine: Engine, yaw: float) -> None:
-    # Half a millimetre apart, so that one of them just misses the wall at the end of a step.
+    # Robots start half a millimetre apart from arena to arena, so that one of them just misses the
+    # wall at the end of a step.
     pose = np.stack([alone(0.2 + 0.0005 * arena, 0.2, yaw) for arena in range(ARENAS)])
     path = drive_all(engine, pose, np.tile(wheels_of(np.array([FULL, 0.0])), (60, 1)))
     gap = 0.5 * SIDE - RADIUS - np.max(np.abs(path.pose[:, :, 0, :2]), axis=-1)
-    # What a step brings is felt in the next one: it sinks by a step at full speed at most, 4 mm,
-    # and never by more. 1e-5 m: float32, 60 steps.
+    # A contact acts only from the next step on, so the robot sinks in by at most one step at full
+    # speed, 4 mm. 1e-5 m is the rounding of float32 over 60 steps.
     assert gap.min() >= -FULL * STEP - 1e-5
     if _body(engine) == "planar":
         assert gap.min() < -0.5 * FULL * STEP * np.cos(yaw), "the worst case was met"
-        # In the end it pushes and the soft wall (MuJoCo's default contact) balances it: 0.7 mm.
+        # The soft wall (MuJoCo's default contact) then balances the robot's push at 0.7 mm.
         assert np.all(np.abs(gap[-1] + 0.0006) < 0.0002)
     else:
-        # Its wheels slip, and hop by about what they slip in a physics step: 2 mm.
+        # The wheels slip, and the robot hops by about the distance slipped in a physics step, 2 mm.
         assert np.all(np.abs(gap[-20:]) < 0.002)
 
 
@@ -391,7 +398,8 @@ def test_parked_robots_stay_where_they_are(engine: Engine) -> None:
     wheels = np.zeros((40, ARENAS, ROBOTS, 2))
     wheels[:, :, 0] = wheels_of(np.array([FULL, 0.0]))  # into the east wall
     path = drive_all(engine, pose, wheels)
-    # planar: exactly; wheeled: they settle on the floor, by far less than a micrometre aside.
+    # Planar robots do not move at all. Wheeled robots settle on the floor and move sideways by far
+    # less than a micrometre.
     close = 0.0 if _body(engine) == "planar" else 1e-6
     expected = np.broadcast_to(pose[1:], (40, ARENAS, 2, 3))
     np.testing.assert_allclose(path.pose[:, :, 1:], expected, rtol=0.0, atol=close)
@@ -399,17 +407,19 @@ def test_parked_robots_stay_where_they_are(engine: Engine) -> None:
 
 @pytest.mark.parametrize("half", [0.03, BIGGEST_HALF])
 def test_an_obstacle_is_felt_where_its_face_is(engine: Engine, half: float) -> None:
-    # A robot at 0.26 m drives at a box centred on the origin, whose half edge the step is told.
+    # A robot at 0.26 m drives towards a box centred on the origin. The box's half edge is an
+    # argument of the step.
     obstacle = np.array([[0.0, 0.0, 0.0, half, half], AWAY[1]], np.float32)
     ahead = np.tile(wheels_of(np.array([FULL, 0.0])), (80, 1))
     path = drive_all(engine, alone(0.26, 0.0, np.pi), ahead, obstacle)
     gap = path.pose[:, :, 0, 0] - half - RADIUS
     reached = int(np.argmax(gap[:, 0] <= 0.0))
-    # It is free until it meets the face: 4.02 mm a step from 0.26 m; the wheeled one starts late.
+    # The robot is free until it meets the face, and drives 4.02 mm per step from 0.26 m. A wheeled
+    # robot meets the face up to one step later.
     expected = int(np.ceil((0.26 - half - RADIUS) / (FULL * STEP))) - 1
     assert expected <= reached <= expected + (_body(engine) == "wheeled")
     assert np.all(gap >= -FULL * STEP - 1e-5)  # as with walls
-    assert np.all(np.abs(gap[-1]) < (0.0008 if _body(engine) == "planar" else 0.002))  # likewise
+    assert np.all(np.abs(gap[-1]) < (0.0008 if _body(engine) == "planar" else 0.002))  # as above
 
 
 def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
@@ -430,7 +440,11 @@ def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
 
 @pytest.mark.parametrize(("arenas", "room"), [(1, 50), (64, 64 * 50), (1000, 1000 * 15)])
 def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
-    """5 robots, 4 boxes, 4 walls: 10 pairs of robots and 5 x 8 others; of many, 3 a robot."""
+    """Checks the room for contacts of 5 robots, 4 boxes and 4 walls.
+
+    With few arenas there is room for all 10 pairs of robots and all 5 x 8 other pairs. With many
+    arenas there is room for 3 contacts per robot.
+    """
     given = settings("warp", "planar")
     sim = dataclasses.replace(given.sim, solver="mjx", max_robots=5, max_obstacles=4)
     minibatches = dataclasses.replace(given.algo, num_minibatches=1)
@@ -448,7 +462,10 @@ def test_substeps_make_up_one_control_step() -> None:
 
 
 def test_servos_are_felt_anew_in_every_physics_step() -> None:
-    """Three a control step: a force that outlasted its own would drive a robot beyond its speed."""
+    """Compares three physics steps per control step with MuJoCo C.
+
+    A servo's force that stayed beyond its physics step would drive a robot beyond its speed.
+    """
     given = settings("jax", "planar")
     engine = load_as(dataclasses.replace(given, sim=dataclasses.replace(given.sim, substeps=3)))
     pose, wheels = _yaws(5, [(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)]), _random_wheels(7, 20, 1)
@@ -465,6 +482,7 @@ def test_encoders_count_whole_steps_of_the_wheels() -> None:
     qpos = model.BODIES["wheeled"].qpos(np.zeros((ROBOTS, 3)), np).reshape(ROBOTS, 9)
     assert built.nq == qpos.size
     qpos[:, 7:] = [[0.00627, 0.00629], [1.0, -0.001], [0.0, 6.28]]
-    # 1 rad = 159.2 steps; a step back counts as soon as it begins; 6.28 rad are 1000.
+    # 1 rad is 159.2 encoder steps, and 6.28 rad are 1000. A step backwards counts as soon as it
+    # begins.
     expected = np.array([[0, 1], [159, -1], [0, 1000]]) * epuck.ENCODER_STEP
     np.testing.assert_allclose(wheeled.encoders(qpos.reshape(-1), np), expected, atol=1e-12)

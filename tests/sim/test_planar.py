@@ -1,4 +1,4 @@
-"""The planar body's servos as forces, against those of MuJoCo C's actuators, in float64."""
+"""Tests the planar body's servo forces against MuJoCo C's actuators, in float64."""
 
 import dataclasses
 from typing import NamedTuple
@@ -14,8 +14,8 @@ from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.planar import PLANAR
 
 SIZE = model.ArenaSize(1, 0, 0.05)
-COUNT = 200  # states of each robot
-ROUNDING = 1e-12  # of the largest force: float64, gain * set point - gain * velocity
+COUNT = 200  # Random states of each robot.
+ROUNDING = 1e-12  # Of the largest force; float64 of gain * set point - gain * velocity.
 
 
 class State(NamedTuple):
@@ -27,9 +27,10 @@ class State(NamedTuple):
 
 
 def _states(wheel_radius: np.ndarray, track: np.ndarray) -> State:
-    """Half of them a little beside their set point, half of them far from it, and saturated.
+    """Returns random states: half are close to their set point, half are far from it and saturated.
 
-    Set points are worked out here: v = r (L + R) / 2 and w = r (R - L) / track, of each wheel's r.
+    Checks the set points against v = r (L + R) / 2 and w = r (R - L) / track, with each wheel's own
+    radius r.
     """
     random = np.random.default_rng(3)
     pose = random.uniform(-4.0, 4.0, (COUNT, ROBOTS, 3))
@@ -48,7 +49,7 @@ def _states(wheel_radius: np.ndarray, track: np.ndarray) -> State:
 
 
 def _in_c(built: mujoco.MjModel, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Forces [N, V] of the actuators on the joints, and which actuators [N, U] are saturated."""
+    """Returns the actuators' forces [N, V] on the joints, and which actuators [N, U] saturate."""
     data, force, full = mujoco.MjData(built), [], []
     for qpos, qvel, ctrl in zip(*state, strict=True):
         data.qpos, data.qvel, data.ctrl = qpos, qvel, ctrl
@@ -59,7 +60,7 @@ def _in_c(built: mujoco.MjModel, state: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check(force: np.ndarray, expected: np.ndarray, full: np.ndarray) -> None:
-    """[N, R * 3] of forces, N and N m, and which servos are saturated."""
+    """Compares forces [N, R * 3], in N and N m, and checks that 20 to 80 % of servos saturate."""
     largest = np.tile(np.abs(expected).reshape(-1, 3).max(axis=0), ROBOTS)
     assert np.all(np.abs(force - expected) <= ROUNDING * largest)
     share = full.reshape(-1, 3).mean(axis=0)
@@ -85,7 +86,7 @@ DRAWN = Chassis(wheel_radius=WHEEL_RADIUS, track=TRACK, mass=MASS, friction=FRIC
 
 
 def _as_drawn(robot: RobotConfig, i: int) -> RobotConfig:
-    """Robot i of `DRAWN` in the config's words: its inertia grows with its mass."""
+    """Returns the config of robot i of `DRAWN`, whose yaw inertia grows with its mass."""
     return dataclasses.replace(
         robot,
         mass=float(MASS[i]),
@@ -96,7 +97,7 @@ def _as_drawn(robot: RobotConfig, i: int) -> RobotConfig:
 
 
 def test_forces_follow_the_chassis() -> None:
-    """Against each robot compiled so, alone."""
+    """Compares the forces with those of each robot compiled alone with its own chassis."""
     robot, state = RobotConfig(motor_lag=0.1), _states(WHEEL_RADIUS, TRACK)
     force, full = [], []
     for i in range(ROBOTS):
@@ -112,7 +113,7 @@ def test_forces_follow_the_chassis() -> None:
 
 
 def test_actuators_follow_the_chassis() -> None:
-    """Changes of a compiled model, against robots compiled so."""
+    """Compares a model changed after compilation with robots compiled with the same chassis."""
     robot = RobotConfig(motor_lag=0.1)
     size = SIZE._replace(robots=ROBOTS)
     built = model.build(robot, size, STEP).compile()

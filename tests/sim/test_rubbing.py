@@ -1,4 +1,4 @@
-"""Hulls that rub: both bodies and all solvers against MuJoCo C, and against Coulomb's law."""
+"""Tests friction of hulls: both bodies and all solvers, against MuJoCo C and Coulomb's law."""
 
 import dataclasses
 import math
@@ -35,7 +35,8 @@ from swarmjax.sim.wheeled import WHEELED
 Impl = Literal["jax", "warp"]
 Solver = Literal["auto", "mjx", "swarm"]
 SIDE, RADIUS = 0.6, 0.037
-# A doorway of 0.13 m, 0.04 m deep, between two boxes; the arena's corners lie behind them.
+# A doorway between two boxes, 0.13 m wide and 0.04 m deep. The arena's corners lie behind the
+# boxes.
 DOORWAY = np.array([[0.0, 0.215, 0.0, 0.02, 0.15], [0.0, -0.215, 0.0, 0.02, 0.15]], np.float32)
 
 
@@ -46,10 +47,11 @@ def _engine(impl: Impl, robot: RobotConfig, solver: Solver = "auto") -> Engine:
 
 
 def _jams() -> tuple[np.ndarray, np.ndarray]:
-    """Poses [A, R, 3] and commands [A, R, 2] of robots that press.
+    """Returns poses [A, R, 3] and commands [A, R, 2] of robots that press against something.
 
-    Three into the doorway at once, abreast; into a corner, one behind the other; into the box and
-    the wall beside it; and into each other.
+    In arenas 0 and 1 three robots press into the doorway abreast. In arenas 2 and 3 the robots
+    press into a corner, one behind another. In arenas 4 and 5 they press into a box and the walls.
+    In the other arenas they press into each other.
     """
     pose = np.zeros((ARENAS, ROBOTS, 3), np.float32)
     pose[:2] = [(-0.06, 0.0, 0.0), (-0.075, 0.078, -0.5), (-0.075, -0.08, 0.4)]
@@ -67,7 +69,10 @@ def _jams_in_c(robot: RobotConfig, pose: np.ndarray, wheels: np.ndarray) -> Path
 
 
 def _check_jammed(path: Path) -> None:
-    """In most steps two of three robots touch something, and in the doorway both kinds of it."""
+    """Checks that every arena has one contact per control step or more on average.
+
+    In the doorway there must be contacts between robots and contacts with obstacles.
+    """
     found = np.zeros((ARENAS, 3), int)
     for now in path.pose:
         for a, each in enumerate(now):
@@ -76,8 +81,9 @@ def _check_jammed(path: Path) -> None:
     assert (found[:2, [gaps.KINDS.index("robot"), gaps.KINDS.index("obstacle")]] > 0).all(), found
 
 
-# Over 60 control steps, 3 x 60 robot steps in contact in most arenas, float32 made of it by all
-# three, and either friction, at most 4.3e-7 m and 7.4e-6 rad; twice that, rounded up.
+# The largest errors of float32 were 4.3e-7 m and 7.4e-6 rad, for all three engines and both
+# frictions, over 60 control steps, with 3 x 60 robot steps in contact in most arenas. The bounds
+# are twice these errors, rounded up.
 CLOSE, CLOSE_YAW = 9e-7, 1.5e-5
 
 
@@ -102,29 +108,33 @@ def test_jams_of_wheeled_robots_as_in_c() -> None:
     expected = _jams_in_c(robot, pose, wheels)
     found = drive_all(_engine("warp", robot), pose, wheels, DOORWAY, side=SIDE)
     apart = np.abs(found.pose - expected.pose)
-    # Float32 made of it 2.0e-6 m and 4.8e-5 rad; twice that.
+    # The largest errors of float32 were 2.0e-6 m and 4.8e-5 rad. The bounds are twice these errors.
     assert apart[..., :2].max() <= 4e-6
     assert apart[..., 2].max() <= 1e-4
     smooth = _jams_in_c(dataclasses.replace(robot, hull_friction=0.0), pose, wheels)
     assert np.abs(smooth.pose - expected.pose)[..., :2].max() > 1e-3
 
 
-# Coulomb's law by hand. A planar robot that hardly turns (its moment of inertia is 1e5 times an
-# e-puck's) drives at an angle against the wall east of it. Its servos pull it with g (v - what it
-# has) along its heading and with -g (what it has) across it, g = m / dt; together, with a speed s
-# along the wall and v commanded at the angle a to the wall's normal,
+# Coulomb's law by hand. A planar robot drives at an angle against the wall east of it. The robot
+# hardly turns, since its moment of inertia is 1e5 times an e-puck's. With g = m / dt, its servos
+# pull it with g (v - u) along its heading, where u is its speed along its heading, and with -g w
+# across its heading, where w is its speed across. With a speed s along the wall and v commanded at
+# the angle a to the wall's normal, the servos' force is
 #   along the wall  g (v sin a - s),   into the wall  g v cos a.
-# It slides if the first exceeds friction times the second: s = v (sin a - friction cos a). Below
-# that it creeps, since MuJoCo's friction is soft: R F = b s, with R = (1 - d) / d * 2 / (3 m), the
-# inverse mass being the mean of three axes of which one does not give way, and b = 2 / (0.95 *
-# 2 dt), so that s = v sin a * R g / (b + R g). Beyond tan a = friction + (1 + friction^2) R g /
-# (b friction), 0.55 here, a contact parts because its surfaces slide, and there is no steady speed.
+# The robot slides if the first exceeds friction times the second: s = v (sin a - friction cos a).
+# Below that the robot creeps, as MuJoCo's friction is soft: R F = b s, with b = 2 / (0.95 * 2 dt),
+# R = (1 - d) / d * 2 / (3 m), so that s = v sin a * R g / (b + R g). R has the mean inverse mass
+# of three axes, of which one has no joint. Beyond tan a = friction + (1 + friction^2) R g /
+# (b friction), 0.55 here, sliding opens the contact, and there is no steady speed.
 FRICTION, HEAVY = 0.3, 10.0
 SLIDES = {0.1: False, 0.2: False, 0.28: False, 0.35: True, 0.4: True, 0.5: True}  # tan a
 
 
 def _impedance(angle: float) -> float:
-    """d of a robot at rest against the wall: k d depth = R F, with k = 1 / (0.95 * 2 dt)^2."""
+    """Returns the impedance d of a robot that rests against the wall.
+
+    The impedance solves k d depth = R F, with k = 1 / (0.95 * 2 dt)^2.
+    """
     depth, d = 0.0, 0.9
     for _ in range(50):
         depth = _give(d) * FULL * math.cos(angle) * (0.95 * 2.0 * STEP) ** 2 / d
@@ -134,12 +144,12 @@ def _impedance(angle: float) -> float:
 
 
 def _give(d: float) -> float:
-    """R g, 1/s."""
+    """Returns R g in 1/s, by the equations above `FRICTION`."""
     return (1.0 - d) / d * 2.0 / 3.0 / STEP
 
 
 def _along_wall(angle: float) -> float:
-    """The speed along the wall, m/s, as above."""
+    """Returns the speed along the wall in m/s, by the equations above `FRICTION`."""
     if math.tan(angle) > FRICTION:
         return FULL * (math.sin(angle) - FRICTION * math.cos(angle))
     give, damping = _give(_impedance(angle)), 2.0 / (0.95 * 2.0 * STEP)
@@ -148,7 +158,7 @@ def _along_wall(angle: float) -> float:
 
 @pytest.fixture(scope="module")
 def pressed() -> dict[str, np.ndarray]:
-    """Speeds along the wall [angles] after 40 control steps, m/s, by each engine."""
+    """Returns each engine's speeds along the wall [angles] in m/s, after 40 control steps."""
     robot = RobotConfig(yaw_inertia=HEAVY, hull_friction=FRICTION)
     wheels = np.broadcast_to(wheels_of(np.array([FULL, 0.0])), (40, ROBOTS, 2))
     poses = np.stack([alone(0.5 * SIDE - RADIUS - 1e-4, -0.1, math.atan(t)) for t in SLIDES])
@@ -170,7 +180,7 @@ def test_a_robot_slides_along_a_wall_by_coulombs_law(
 ) -> None:
     angle, slides = list(map(math.atan, SLIDES))[row], list(SLIDES.values())[row]
     assert (_along_wall(angle) > 0.06 * FULL * math.sin(angle)) == slides
-    # After 1.28 s of settling 0.03 % is left, and a heading that creeps by 1e-5 rad.
+    # After 1.28 s the speed is 0.03 % off its steady value, and the heading has crept by 1e-5 rad.
     assert pressed[engine][row] == pytest.approx(_along_wall(angle), rel=1e-3)
 
 
@@ -182,7 +192,8 @@ def test_an_episode_may_have_a_friction_of_its_own(impl: Impl) -> None:
     expected = drive_all(smooth, pose, wheels, DOORWAY, side=SIDE)
     drawn = Chassis(hull_friction=jnp.float32(0.3))
     found = drive_all(rough, pose, wheels, DOORWAY, side=SIDE, chassis=drawn)
-    # The same number in the same program; XLA may round a constant otherwise than an argument.
+    # Both programs compute with the same friction, but XLA may round a constant differently from an
+    # argument.
     np.testing.assert_allclose(found.pose, expected.pose, atol=1e-6)
     nominal = drive_all(rough, pose, wheels, DOORWAY, side=SIDE)
     assert np.abs(nominal.pose - expected.pose).max() > 1e-3
@@ -214,7 +225,7 @@ def test_no_other_force_in_the_cone_is_nearer(
 ) -> None:
     best = rubbing_jax.project(rubbing_jax.Force(*map(jnp.float32, wanted)), *cost, friction)
     push, rub = float(best.push), float(best.rub)
-    assert abs(rub) <= friction * push + 1e-5  # float32, of numbers up to 40
+    assert abs(rub) <= friction * push + 1e-5  # float32 for numbers up to 40
     far = np.linspace(0.0, 50.0, 501)
     rubs = np.linspace(-1.0, 1.0, 41)[:, None] * friction * far
     total = cost[0] * (far - wanted[0]) ** 2 + cost[1] * (rubs - wanted[1]) ** 2

@@ -1,4 +1,4 @@
-"""The solvers made for swarms, on arenas so crowded that all robots push each other, against C."""
+"""Tests the swarm solvers against MuJoCo C, in arenas so crowded that robots push each other."""
 
 import itertools
 from typing import Any, Literal
@@ -41,9 +41,9 @@ def _load(
 
 
 def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Poses [A, R, 3] anywhere in the arena, one robot within another, and speeds of their wheels.
+    """Returns random poses [A, R, 3] of robots that overlap each other, and their wheel speeds.
 
-    Half of the robots in one arena in two overlap a wall or the box as well.
+    At a side of 0.5 m a third of the robots also overlap a wall or the box, and at 0.16 m most do.
     """
     random = np.random.default_rng(3)
     pose = random.uniform(-0.5, 0.5, (ARENAS, ROBOTS, 3)) * [side, side, 6.0]
@@ -60,7 +60,7 @@ def _on_device(
     wheels: np.ndarray,
     box: np.ndarray = BOX,
 ) -> Any:
-    """Velocities of the joints [A, V] after a control step from rest."""
+    """Returns the joint velocities [A, V] after one control step from rest."""
 
     def move(pose: Any, wheels: Any) -> Any:
         data = physics.unpack(loaded, physics.rest(loaded, pose))
@@ -76,7 +76,10 @@ def _in_c(
     wheels: np.ndarray,
     box: np.ndarray = BOX,
 ) -> tuple[np.ndarray, int]:
-    """The same by MuJoCo C in float64, converged; and how many pairs of robots touch at first."""
+    """Returns joint velocities by MuJoCo C, and how many pairs of robots touch at the start.
+
+    MuJoCo C computes in float64, and its solver iterates until it converges.
+    """
     count = physics_substeps(robot, None)
     size = model.ArenaSize(ROBOTS, len(box), 0.05)
     spec = model.build(robot, size, STEP / count)
@@ -97,11 +100,11 @@ def _in_c(
     return data.qvel.copy(), pairs
 
 
-# In 0.16 m more pairs touch than the wheeled robots' solver takes as terms of their own (8), and
-# the planar ones' sweeps come to rest slowly; MJX's few Newton steps by JAX do not get there at
-# all. Float32 rounds at 1e-7, and a wheel's grip is 1e3 times as stiff as its robot. Off by these
-# shares of the fastest joint and of the fastest robot were the velocities seen; twice that is
-# allowed.
+# At a side of 0.16 m more pairs touch than the wheeled solver treats as separate terms (8). The
+# sweeps of the planar solver converge slowly there, and the few Newton steps of MJX by JAX do not
+# converge. Float32 rounds at 1e-7, and a wheel's grip is 1e3 times as stiff as its robot. Each row
+# holds the largest errors measured, as shares of the fastest joint's and of the fastest robot's
+# velocity. The tests allow twice these errors.
 CROWDS = {
     ("warp", "planar", "swarm", 0.16): (4.0e-6, 2.1e-5),
     ("jax", "planar", "swarm", 0.16): (2.4e-6, 1.2e-5),
@@ -116,9 +119,10 @@ CROWDS = {
     ("warp", "wheeled", "mjx", 0.5): (2.1e-5, 1.7e-5),
     ("jax", "planar", "mjx", 0.5): (4.2e-6, 1.6e-6),
 }
-# A wall across the arena with a door of 0.13 m.
+# A wall across the arena, with a doorway of 0.13 m.
 DOOR = np.array([[0.0, 0.315, 0.0, 0.01, 0.25], [0.0, -0.315, 0.0, 0.01, 0.25]], np.float32)
-# Off by these shares of the fastest joint were the velocities seen, as above.
+# The largest errors measured, as shares of the fastest joint's velocity. The test allows twice as
+# much.
 JAMS = {
     ("warp", "planar", "swarm"): 1.3e-5,
     ("jax", "planar", "swarm"): 8.5e-6,
@@ -131,7 +135,8 @@ JAMS = {
 @pytest.mark.parametrize(("impl", "body", "solver"), JAMS)
 def test_robots_jam_in_a_doorway_as_in_c(impl: Impl, body: BodyName, solver: Solver) -> None:
     pose, wheels = _jams()
-    # Warp looks for contacts within the largest box of the stages.
+    # Warp looks for contacts only within the size of the largest box in the stages, so this stage
+    # has a door.
     stage = StageConfig(
         name="door", level="door", robots=ROBOTS, side=1.3, obstacles=2, gap=0.13, apart=0.25
     )
@@ -145,9 +150,10 @@ def test_robots_jam_in_a_doorway_as_in_c(impl: Impl, body: BodyName, solver: Sol
 
 
 def _jams() -> tuple[np.ndarray, np.ndarray]:
-    """Poses and speeds of wheels of three robots that push into a door, and two that stand by."""
+    """Returns poses and wheel speeds: three robots push into a doorway, and two are far from it."""
     random = np.random.default_rng(4)
-    # Each a millimetre or two within the others; the first two touch the jambs.
+    # The first three robots overlap each other, and the first two touch the jambs. Each place is
+    # shifted at random by up to 2 mm along x and y.
     places = np.array([(-0.01, 0.030), (-0.01, -0.030), (-0.070, 0.0), (-0.3, 0.3), (0.3, -0.3)])
     pose = np.zeros((ARENAS, ROBOTS, 3), np.float32)
     pose[..., :2] = places + random.uniform(-0.002, 0.002, (ARENAS, ROBOTS, 2))
@@ -158,7 +164,7 @@ def _jams() -> tuple[np.ndarray, np.ndarray]:
     return pose, wheels.astype(np.float32)
 
 
-PAIRS = {0.16: 9, 0.5: 2}  # of robots that touch, at least
+PAIRS = {0.16: 9, 0.5: 2}  # the fullest arena has this many touching pairs or more, by side in m
 
 
 @pytest.mark.parametrize(("impl", "body", "solver", "side"), CROWDS)
@@ -174,13 +180,14 @@ def test_crowds_push_each_other_apart_as_in_c(
     each = [_in_c(RobotConfig(body=body), side, p, w) for p, w in zip(pose, wheels, strict=True)]
     expected, pairs = np.array([one[0] for one in each]), [one[1] for one in each]
     assert max(pairs) >= PAIRS[side]
-    assert np.abs(expected).max(axis=1).min() > 1.0  # they do fly apart
+    assert np.abs(expected).max(axis=1).min() > 1.0  # the robots fly apart
     assert _off(found, expected) <= 2.0 * seen[0]
     assert _off(_places(found), _places(expected)) <= 2.0 * seen[1]
 
 
-# Likewise with friction. In the tightest jam sweeps come to rest more slowly, and MJX's Newton
-# method by Warp is nearer: to be as near would take a tolerance of 1e-7, seldom met in float32.
+# The largest errors measured with friction between hulls, in the columns of `CROWDS`. At 0.16 m the
+# sweeps converge more slowly than without friction, and MJX's Newton method by Warp is closer to
+# MuJoCo C. To be as close the sweeps would need a tolerance of 1e-7, which float32 seldom reaches.
 RUBBING = {
     ("jax", "swarm", 0.16): (1.1e-4, 5.4e-5),
     ("warp", "swarm", 0.16): (1.2e-4, 2.8e-5),
@@ -205,10 +212,10 @@ def test_crowds_that_rub_push_each_other_apart_as_in_c(
 
 
 def _beside_the_box(pose: np.ndarray) -> np.ndarray:
-    """Moves robots whose centre is deep within the box to 8 mm from a face of it.
+    """Moves robots whose centre is deep inside the box to 8 mm behind one of its faces.
 
-    There MuJoCo pushes them down, where no joint gives way, and brakes them by friction with that
-    push; discs leave them alone.
+    Deep inside the box MuJoCo pushes a robot down, where it has no joint, and the friction of that
+    push brakes the robot. The solver of discs applies no such force.
     """
     x, y, yaw, half = BOX[0, :4]
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -228,14 +235,16 @@ def test_auto_takes_a_faster_step_only_where_it_is_held_as_closely_as_mjx(
     impl: Impl, body: BodyName, side: float
 ) -> None:
     assert dispatch.resolve_solver("auto", impl, body, ROBOTS) == "swarm"
-    # Over all joints; that of discs is off by up to 8e-6 m/s along x and y in the jam, by rounding.
+    # Compares the errors over all joints. Along x and y alone the solver of discs is off by up to
+    # 8e-6 m/s at 0.16 m, by rounding.
     assert CROWDS[impl, body, "swarm", side][0] <= CROWDS[impl, body, "mjx", side][0]
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
 def test_what_lies_in_one_place_is_pushed_apart_as_in_c(impl: Impl) -> None:
-    # Two hulls in one place; one in the middle of the box (half edges 0.05), where its bottom is
-    # nearest; one just within one of its faces; one in a corner of the arena.
+    # Two hulls share one place. One hull is in the middle of the box (half edges 0.05), where the
+    # box's bottom is the nearest face. One hull is just inside a side face of the box, and one hull
+    # is in a corner of the arena.
     box = BOX[0]
     turn = np.array([[np.cos(box[2]), -np.sin(box[2])], [np.sin(box[2]), np.cos(box[2])]])
     within = box[:2] + turn @ [0.04, 0.0]
@@ -246,7 +255,8 @@ def test_what_lies_in_one_place_is_pushed_apart_as_in_c(impl: Impl) -> None:
     found = _on_device(_load(impl, "planar", "swarm"), 1.3, pose, wheels)[0].reshape(ROBOTS, 3)
     expected = _in_c(RobotConfig(), 1.3, pose[0], wheels[0])[0].reshape(ROBOTS, 3)
     assert np.abs(expected[[0, 1, 3, 4], :2]).max(axis=1).min() > 0.1
-    # Float32: 1e-7 of numbers about 1, times a contact's stiffness of 10 or so.
+    # Float32 rounds numbers of about 1 by 1e-7, and a contact multiplies that by its stiffness of
+    # about 10.
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -260,7 +270,7 @@ def test_arenas_of_several_seeds_are_arenas_of_one_kernel(obstacles: int) -> Non
         return physics.step(loaded, data, side, boxes, wheels).qvel
 
     once = jax.jit(jax.vmap(move))
-    # Sides differ by seed alone, and the box is one for all.
+    # The arenas of one seed have the same side, and all arenas share one box.
     sides, half = jnp.array([0.16, 0.5], jnp.float32), ARENAS // 2
     expected = once(np.repeat(sides, half), pose, wheels)
     split = (x.reshape(2, half, *x.shape[1:]) for x in (pose, wheels))
@@ -276,14 +286,14 @@ def test_every_pair_of_robots_meets_once(robots: int) -> None:
     met = [(a, b) for row in rounds for a, b in enumerate(row) if a < b]
     assert sorted(met) == list(itertools.combinations(range(robots), 2))
     for row in rounds:
-        np.testing.assert_array_equal(row[row], range(robots))  # whoever I meet meets me
+        np.testing.assert_array_equal(row[row], range(robots))  # meetings are mutual
 
 
 def _places(rate: np.ndarray) -> np.ndarray:
-    """Of velocities of joints [A, V] those along x and y."""
+    """Returns those joint velocities [A, V] that are along x and y."""
     return rate.reshape(ARENAS, ROBOTS, -1)[..., :2].reshape(ARENAS, -1)
 
 
 def _off(found: np.ndarray, expected: np.ndarray) -> float:
-    """The largest error of an arena's numbers [A, ...], as a share of its largest number."""
+    """Returns the largest error over arenas [A, ...], as a share of each arena's largest number."""
     return float((np.abs(found - expected).max(axis=1) / np.abs(expected).max(axis=1)).max())

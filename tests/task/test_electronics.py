@@ -1,4 +1,4 @@
-"""Commands on their way to the wheels and sensors on theirs to the policy, by hand."""
+"""Tests the paths from command to wheels and from sensors to policy, by hand-computed values."""
 
 import math
 from types import ModuleType
@@ -30,14 +30,14 @@ RESPONSES = pytest.mark.parametrize("kind", ["ideal", "webots", "real"])
 Encoding = Literal["metric", "webots"]
 Kind = Literal["ideal", "webots", "real"]
 ARENAS, ROBOTS, SENSORS = 2, 3, 8
-STEP, RANGE, RISE = 0.032, 0.04, math.cos(0.16)  # s, m, and of a ray that is 1 m long
+STEP, RANGE, RISE = 0.032, 0.04, math.cos(0.16)  # s; m; horizontal part of a ray of 1 m
 MOTORS = sim_drive.from_config(RobotConfig())
-SEED = np.array([11, 12], np.uint32)  # of each arena
+SEED = np.array([11, 12], np.uint32)  # one seed per arena
 RATE = 2 * math.pi / 1000  # rad/s at one step of the motor per second
-# Float32 rounds counts of up to 4095 / 1023 by 2.4e-7, distances by less; the steepest slope of
-# the table, 380 / m, times 4e-9 m adds 1.5e-6.
+# Float32 rounds counts of up to 4095 / 1023 by 2.4e-7, and distances by 4e-9 m. Where the table is
+# steepest, 380 / m, these 4e-9 m add 1.5e-6.
 ROUNDING = 2e-6
-FREE = 67.19  # counts of Webots' sensor that sees nothing
+FREE = 67.19  # counts of Webots' sensor when it sees nothing
 
 
 def _electronics(encoding: Encoding | None = None, **realism: Any) -> Electronics:
@@ -45,7 +45,7 @@ def _electronics(encoding: Encoding | None = None, **realism: Any) -> Electronic
 
 
 def _factors(xp: ModuleType, **fields: Any) -> Factors:
-    """Factors of all arenas; whatever is given is broadcast to them."""
+    """Returns the factors of all arenas, with each given value broadcast to them."""
     shapes = {"infrared_period": (ROBOTS,), "observation_latency": (ROBOTS,), "seed": ()}
     shapes |= {"action_latency": (ROBOTS,), "max_wheel_speed": (ROBOTS,)}
     full = {}
@@ -65,7 +65,7 @@ def _sight(
     reflectance: Any = None,
     arenas: int = ARENAS,
 ) -> Sight:
-    """What all robots of all arenas see."""
+    """Returns what the robots of all arenas see, with each given value broadcast to them."""
 
     def full(value: Any, *axes: int) -> Any:
         return xp.asarray(np.broadcast_to(np.float32(value), (arenas, ROBOTS, *axes)))
@@ -75,23 +75,23 @@ def _sight(
 
 
 def _clock(xp: ModuleType, clock: int) -> Any:
-    """As the judge counts: one for each arena."""
+    """Returns the clock as the judge keeps it: one count for each arena."""
     return xp.full(ARENAS, clock)
 
 
 def _first(electronics: Electronics, found: Factors, sight: Sight, xp: ModuleType) -> np.ndarray:
-    """The first observation [A, R, O]."""
+    """Returns the first observation, [A, R, O]."""
     return np.asarray(task_electronics.begin(electronics, found, sight, _clock(xp, 0), xp)[1])
 
 
-# --- what is the same for every episode
+# --- values that are the same for every episode
 
 
 @pytest.mark.parametrize(
     ("kind", "encoding", "sensor_range", "expected"),
     [
         ("ideal", "metric", 0.04, 0.04),
-        ("ideal", "webots", 0.04, 0.07 * RISE),  # the end of Webots' table, seen from above
+        ("ideal", "webots", 0.04, 0.07 * RISE),  # the end of Webots' table, projected to the floor
         ("webots", "metric", 0.04, 0.07 * RISE),
         ("webots", "webots", 0.04, 0.07 * RISE),
         ("real", "metric", 0.04, 0.10),
@@ -134,7 +134,7 @@ def test_mount_and_reflectance_are_there_if_any_part_of_them_is(xp: ModuleType) 
         assert [part is shade for part in found] == [part == name for part in found._fields]
 
 
-# --- nothing is on
+# --- all factors off
 
 
 @MODULES
@@ -162,16 +162,18 @@ def test_with_all_factors_off_nothing_is_touched(xp: ModuleType, encoding: Encod
         np.testing.assert_array_equal(seen[..., BEARING], np.float32(-3.0))
 
 
-# --- what is observed
+# --- observed values
 
-# Every sensor has something 12 mm ahead, of reflectance 0.5, but for ps0. Of the others, ps2 and
-# ps5 look straight out through 6 mm of the robot, so that the gap is 6 mm.
-#   Webots' table: 0.012 / cos 0.16 = 0.0121553 m, 1465.73 - 172854 * 0.0021553 = 1093.19 counts;
-#   with the reflectance 0.0243105 m, 383.84 - 14891 * 0.0043105 = 319.65 counts, as of a ray of
-#   0.024 m that meets something bright.
-#   The measured curve: 0.5 A / (gap + d)^2 is A / (sqrt 2 (gap + d))^2, so that something bright is
-#   taken to be sqrt 2 (gap + d) - d + 0.006 away: 0.0155736 and 0.0161450 m, which in Webots' table
-#   (0.0157751 and 0.0163539 m) make 601.46 - 43524 * 0.0007751 = 567.72 and 542.53 counts.
+# Every sensor except ps0 has an object of reflectance 0.5 at 12 mm. Of these sensors, ps2 and ps5
+# look straight out through 6 mm of the robot, so that their gap to the object is 6 mm.
+#   Webots' table: the ray is 0.012 / cos 0.16 = 0.0121553 m long, which gives
+#   1465.73 - 172854 * 0.0021553 = 1093.19 counts. The reflectance makes it act as 0.0243105 m,
+#   which gives 383.84 - 14891 * 0.0043105 = 319.65 counts, like a ray of 0.024 m to a fully
+#   reflecting object.
+#   The measured curve: 0.5 A / (gap + d)^2 equals A / (sqrt 2 (gap + d))^2. The sensor thus reports
+#   a fully reflecting object at sqrt 2 (gap + d) - d + 0.006: 0.0155736 m for ps2 and 0.0161450 m
+#   for ps5. In Webots' table these are 0.0157751 and 0.0163539 m, which give
+#   601.46 - 43524 * 0.0007751 = 567.72 counts and 542.53 counts.
 PS2, PS5, NOTHING = 2, 5, 0
 OBSERVED = {
     ("ideal", "metric"): (0.012, 0.012, 0.04),
@@ -194,12 +196,12 @@ def test_what_is_observed_of_a_thing_nearby(xp: ModuleType, kind: Kind, encoding
     assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
     assert seen.dtype == np.float32
     ps2, ps5, nothing = OBSERVED[kind, encoding]
-    # The figures above are rounded: counts to 5e-3, lengths to 5e-8 m.
+    # The expected values above are rounded: counts to 5e-3, lengths to 5e-8 m.
     rounding = 5e-3 / 1023 + ROUNDING if encoding == "webots" else 1e-7
     for sensor, expected in ((PS2, ps2), (PS5, ps5), (NOTHING, nothing)):
         found = seen[..., INFRARED][..., sensor]
         np.testing.assert_allclose(found, expected, rtol=0, atol=rounding)
-    # 0.3 m, and a quarter turn to the left.
+    # The target is 0.3 m away, a quarter turn to the left.
     target = (0.3, math.pi / 2) if encoding == "metric" else (0.3 / 1.5, 0.75)
     np.testing.assert_allclose(seen[..., TARGET], np.broadcast_to(target, (ARENAS, ROBOTS, 2)))
 
@@ -225,7 +227,7 @@ def test_a_dead_sensor_sees_nothing(xp: ModuleType, kind: Kind, encoding: Encodi
 def test_wear_of_the_sensors(xp: ModuleType) -> None:
     gain = np.linspace(0.7, 1.3, ARENAS * ROBOTS * SENSORS).reshape(ARENAS, ROBOTS, SENSORS)
     electronics = _electronics("webots", infrared="webots")
-    # 0.0243105 m by the table, as above, of which 67.19 is not reflected.
+    # The ray is 0.0243105 m long in the table, as above. 67.19 counts are not reflected light.
     sight = _sight(xp, 0.024)
     seen = _first(electronics, _factors(xp, infrared_gain=gain), sight, xp)
     expected = (FREE + gain * (319.652 - FREE)) / 1023
@@ -244,17 +246,17 @@ def test_noise_of_the_sensors_is_drawn_at_every_control_step(xp: ModuleType) -> 
     _, later = task_electronics.sense(electronics, memory, worn, sight, clock + 7, xp)
     for now, found in ((0, seen), (7, later)):
         drawn = noise.normal(SEED, np.array(now), Stream.INFRARED, (ROBOTS, SENSORS), np)
-        # Free space has a deviation of 0.04897 of its counts, here twice that.
+        # In free space, the deviation is 0.04897 of the counts; `infrared_noise` doubles it here.
         expected = FREE * (1.0 + 2 * 0.04897 * drawn) / 1023
-        # 1e-6 of it: float32, and the rounding of log and cos.
+        # The relative tolerance covers float32 and the rounding of log and cos.
         np.testing.assert_allclose(found[..., INFRARED], expected, rtol=2e-6)
 
 
 # --- the sensors' period
 
-# Control step n ends at 32 n ms, and sees what was sampled at a multiple of the period: for 50 ms
-# 50 falls into step 2, 100 into 4, 150 into 5, 200 into 7, 250 into 8, 300 into 10, 350 into 11,
-# 400 into 13, 450 into 15 and 500 into 16 (480 to 512).
+# Control step n ends at 32 n ms. Samples are taken at the multiples of the period. With a period of
+# 50 ms, the sample at 50 ms falls into step 2, 100 into 4, 150 into 5, 200 into 7, 250 into 8, 300
+# into 10, 350 into 11, 400 into 13, 450 into 15 and 500 into 16 (480 to 512 ms).
 DUE_50 = [2, 4, 5, 7, 8, 10, 11, 13, 15, 16]
 STEPS = 16
 
@@ -263,7 +265,7 @@ STEPS = 16
 @ENCODINGS
 def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> None:
     electronics = _electronics(encoding, infrared_period=(0.01, 0.05))
-    # Whatever the arena: slow, fast, and in step with the control.
+    # In each arena, robot 0 samples slowly, robot 1 fast, and robot 2 once per control step.
     slow = _factors(xp, infrared_period=[0.05, 0.01, 0.032])
     rays = 0.001 * np.arange(STEPS + 1) + 0.01
     fresh = [_first(electronics, Factors(), _sight(xp, ray), xp)[0, 0, INFRARED][3] for ray in rays]
@@ -279,7 +281,7 @@ def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> 
     np.testing.assert_array_equal(ray[:, :, 0], np.broadcast_to(held, (STEPS + 1, ARENAS, SENSORS)))
     at_once = np.array(fresh)[:, None, None, None]
     np.testing.assert_array_equal(ray[:, :, 1:], np.broadcast_to(at_once, ray[:, :, 1:].shape))
-    # The target comes from elsewhere, and waits for no sample.
+    # The target does not come from the infrared sensors, so it waits for no sample.
     turned = np.array(bearing[1:])
     turned = turned if encoding == "metric" else (turned + math.pi) / (2 * math.pi)
     found = np.stack(found)[1:, :, 0, BEARING]
@@ -287,7 +289,7 @@ def test_a_sample_is_held_until_the_next(xp: ModuleType, encoding: Encoding) -> 
 
 
 def _due(clock: Any, period: Any, xp: Any) -> Any:
-    """Tells [A, R] whether robots sample in control step [A], by what they see of it."""
+    """Returns whether robots sample, [A, R], in control steps [A], inferred from observations."""
     count, robots = period.shape
     electronics = _electronics(infrared_period=(0.01, 0.05))
     none = xp.zeros((count, robots, SENSORS), xp.float32)
@@ -300,8 +302,8 @@ def _due(clock: Any, period: Any, xp: Any) -> Any:
 @MODULES
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0, 2.0, 5.0])
 def test_a_period_in_step_with_the_control_never_slips(xp: ModuleType, share: float) -> None:
-    # 1500 control steps, Table 1's episode. A sample of a period that is a multiple of the step
-    # is due at each of its multiples, of a fraction at every step.
+    # An episode of Table 1 has 1500 control steps. If the period is a multiple of the step, a
+    # sample is due once a period. If it is a fraction of the step, one is due at every step.
     clock = np.arange(1, 1501, dtype=np.int32)
     due = _due(xp.asarray(clock), xp.full((len(clock), 1), share * STEP, xp.float32), xp)
     np.testing.assert_array_equal(due[:, 0], clock % max(share, 1.0) == 0)
@@ -314,13 +316,13 @@ def test_numpy_and_jax_sample_in_the_same_control_steps() -> None:
         mine = _due(np.array([n]), period, np)
         np.testing.assert_array_equal(due(jnp.array([n]), period), mine)
         assert mine[period <= np.float32(STEP)].all()
-        # One of 50 ms falls into 0.64 of the steps, in the mean over periods of 32 to 50 ms into
-        # 0.032 log(50 / 32) / 0.018 = 0.793; five standard errors.
+        # With a period of 50 ms, a sample falls into 0.64 of the steps. The mean over periods of 32
+        # to 50 ms is 0.032 log(50 / 32) / 0.018 = 0.793. The bound is five standard errors.
         slow = mine[period > np.float32(STEP)]
         assert abs(slow.mean() - 0.793) < 5 * math.sqrt(0.793 * 0.207 / len(slow))
 
 
-# --- observations under way
+# --- delayed observations
 
 
 @MODULES
@@ -340,7 +342,7 @@ def test_an_observation_arrives_after_its_latency(xp: ModuleType) -> None:
         memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
         assert seen.shape == (ARENAS, ROBOTS, observation.SIZE)
         arrived.append(np.asarray(seen[..., DISTANCE]))
-    # Of distances 1, 2, .. 6; the first has been seen all along.
+    # The distances are 1, 2, .. 6. Robots observe distance 1 until a later one arrives.
     at_once, next_, second = [2, 3, 4, 5, 6], [1, 2, 3, 4, 5], [1, 1, 2, 3, 4]
     expected = [[at_once, next_, second], [second, second, at_once]]
     np.testing.assert_array_equal(np.moveaxis(arrived, 0, -1), expected)
@@ -364,7 +366,7 @@ def test_a_latency_of_zero_keeps_nothing(xp: ModuleType) -> None:
 
 @MODULES
 def test_a_late_sample_is_both_held_and_late(xp: ModuleType) -> None:
-    """A sample every second control step, which the policy sees one step later."""
+    """Samples at every second control step; the policy observes each sample one step later."""
     electronics = _electronics(observation_latency=(1, 1), infrared_period=(0.064, 0.064))
     found = _factors(xp, observation_latency=np.int32(1), infrared_period=0.064)
     memory, _ = task_electronics.begin(electronics, found, _sight(xp, 0.010), _clock(xp, 0), xp)
@@ -373,7 +375,7 @@ def test_a_late_sample_is_both_held_and_late(xp: ModuleType) -> None:
         sight = _sight(xp, 0.010 + 0.001 * n)
         memory, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, n), xp)
         arrived.append(round(1000 * float(seen[1, 2, INFRARED][3])))
-    # Sampled in steps 0, 2, 4, 6.
+    # The sensor samples in steps 0, 2, 4 and 6.
     assert arrived == [10, 10, 12, 12, 14, 14]
 
 
@@ -383,7 +385,7 @@ MANY = 20_000
 
 
 def _targets(xp: ModuleType, distance: float, bearing: float, **realism: Any) -> np.ndarray:
-    """Distances and bearings [MANY, R, 2] that as many seeds make of a target."""
+    """Returns the observed distance and bearing of one target for MANY seeds, [MANY, R, 2]."""
     found = Factors(seed=xp.arange(MANY, dtype=xp.uint32))
     sight = _sight(xp, 1.0, distance, bearing, arenas=MANY)
     clock = xp.zeros(MANY, xp.int32)
@@ -395,12 +397,12 @@ def _targets(xp: ModuleType, distance: float, bearing: float, **realism: Any) ->
 def test_noise_of_the_target(xp: ModuleType) -> None:
     far, angle = 0.005, 0.0524
     seen = _targets(xp, 0.5, 1.0, target_distance_noise=far, target_bearing_noise=angle)
-    # Five standard errors, sd / sqrt(n) and sd / sqrt(2 n); the seeds are fixed.
+    # Five standard errors: sd / sqrt(n) and sd / sqrt(2 n). The seeds are fixed.
     for i, (mean, sd) in enumerate(((0.5, far), (1.0, angle))):
         drawn = seen[..., i].astype(float)
         assert (abs(drawn.mean(axis=0) - mean) < 5 * sd / math.sqrt(MANY)).all()
         assert (abs(drawn.std(axis=0) - sd) < 5 * sd / math.sqrt(2 * MANY)).all()
-    # Of one robot and the next, and of distance and bearing, nothing is shared.
+    # Noise is uncorrelated between robots, and between distance and bearing.
     shared = np.corrcoef(seen.reshape(MANY, -1).T) - np.eye(2 * ROBOTS)
     assert abs(shared).max() < 5 / math.sqrt(MANY)
 
@@ -412,7 +414,7 @@ def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> N
     memory, _ = task_electronics.begin(electronics, found, sight, _clock(xp, 0), xp)
     _, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
     drawn = noise.normal(SEED, np.array(9), Stream.TARGET_DISTANCE, (ROBOTS,), np)
-    # Float32, and the rounding of log and cos.
+    # The tolerance covers float32 and the rounding of log and cos.
     np.testing.assert_allclose(seen[..., DISTANCE], 0.3 + 0.01 * drawn, rtol=1e-6)
     np.testing.assert_array_equal(seen[..., BEARING], np.float32(math.pi / 2))
 
@@ -421,9 +423,9 @@ def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> N
 def test_a_bearing_stays_an_angle(xp: ModuleType) -> None:
     seen = _targets(xp, 0.5, math.pi, target_bearing_noise=0.5)[..., 1].astype(float)
     assert abs(seen).max() <= np.float32(math.pi)
-    assert 0.45 < (seen < 0.0).mean() < 0.55  # half of them lie beyond, on the other side
+    assert 0.45 < (seen < 0.0).mean() < 0.55  # half of the readings wrap around pi
     beyond = seen % (2 * math.pi) - math.pi
-    # Five standard errors of the sd.
+    # The bound is five standard errors of the sd.
     assert abs(beyond.std() - 0.5) < 5 * 0.5 / math.sqrt(2 * MANY * ROBOTS)
     np.testing.assert_array_equal(_targets(xp, 0.5, 1.0)[..., 1], np.float32(1.0))
 
@@ -432,7 +434,8 @@ def test_a_bearing_stays_an_angle(xp: ModuleType) -> None:
 def test_a_distance_is_never_negative(xp: ModuleType) -> None:
     seen = _targets(xp, 0.002, 0.0, target_distance_noise=0.004)[..., 0]
     assert seen.min() == 0.0
-    # Half a deviation below the mean lie 30.85 % of a normal distribution; five standard errors.
+    # Of a normal distribution, 30.85 % lie more than half a deviation below the mean. The bound is
+    # five standard errors.
     spread = math.sqrt(0.3085 * 0.6915 / (MANY * ROBOTS))
     assert abs((seen == 0.0).mean() - 0.3085) < 5 * spread
 
@@ -443,7 +446,7 @@ def test_a_distance_is_never_negative(xp: ModuleType) -> None:
 def _wheels(
     xp: ModuleType, found: Factors, commands: list[Any], **realism: Any
 ) -> tuple[np.ndarray, Memory]:
-    """Wheel speeds [T, A, R, 2] of commands that all robots get, and the last memory."""
+    """Sends commands to all robots; returns wheel speeds [T, A, R, 2] and the last memory."""
     electronics = _electronics(**realism)
     memory, _ = task_electronics.begin(electronics, found, _sight(xp), _clock(xp, 0), xp)
     driven = []
@@ -461,7 +464,7 @@ def _wheels(
 def test_a_command_is_late(xp: ModuleType) -> None:
     late = np.array([[0, 1, 2], [2, 0, 1]], np.int32)
     found = _factors(xp, action_latency=late)
-    # 0.02 m/s is 1 rad/s.
+    # At 0.02 m/s the wheels turn at 1 rad/s.
     commands = [(0.02 * n, 0.0) for n in range(1, 5)]
     wheels, memory = _wheels(xp, found, commands, action_latency=(0, 2))
     by_latency = np.array([[1, 2, 3, 4], [0, 1, 2, 3], [0, 0, 1, 2]])
@@ -476,7 +479,7 @@ def test_a_command_is_late(xp: ModuleType) -> None:
 def test_each_robot_has_a_limit_of_its_own(xp: ModuleType) -> None:
     limit = np.array([[3.0, 6.0, 6.9], [5.0, 4.0, 2.0]])
     found = _factors(xp, max_wheel_speed=limit)
-    # 0.1 m/s and 1 rad/s are 5 +- 1.3 rad/s; and the same backward.
+    # At 0.1 m/s and 1 rad/s the wheels turn at 5 +- 1.3 rad/s. The negated command reverses them.
     wheels, _ = _wheels(xp, found, [(0.1, 1.0), (-0.1, -1.0)])
     ahead = np.stack([np.minimum(limit, 3.7), np.minimum(limit, 6.3)], axis=-1)
     np.testing.assert_allclose(wheels, [ahead, -ahead], rtol=1e-6)  # float32
@@ -484,10 +487,10 @@ def test_each_robot_has_a_limit_of_its_own(xp: ModuleType) -> None:
 
 @MODULES
 def test_limit_then_quantisation_then_noise(xp: ModuleType) -> None:
-    """A wheel that the firmware holds to 3 rad/s turns a little faster, and inexactly."""
+    """Limits a wheel to 3 rad/s, which quantisation raises a little and noise then varies."""
     found = _factors(xp, max_wheel_speed=3.0, seed=SEED)
     clamped, _ = _wheels(xp, found, [(0.1, 0.0)], speed_quantisation="epuck2")
-    # 3 rad/s are 477.46 steps/s; 50000 // 477 = 104 ticks, which make 480.77 steps/s.
+    # 3 rad/s are 477.46 steps/s. A step takes 50000 // 477 = 104 ticks, which gives 480.77 steps/s.
     np.testing.assert_allclose(clamped, 50000 / 104 * RATE, rtol=1e-6)  # float32
     both = {"speed_quantisation": "epuck2", "speed_noise": 0.05}
     wheels, _ = _wheels(xp, found, [(0.1, 0.0)] * 3, **both)
@@ -501,7 +504,7 @@ def test_limit_then_quantisation_then_noise(xp: ModuleType) -> None:
 def test_a_stall_keeps_the_last_command(xp: ModuleType) -> None:
     found, steps = _factors(xp, seed=SEED), 40
     commands = [(0.001 * n, 0.0) for n in range(1, steps + 1)]  # 0.05 n rad/s
-    # 0.1 s are 3.1 control steps, which are 3.
+    # A stall of 0.1 s is 3.1 control steps, rounded to 3.
     wheels, memory = _wheels(xp, found, commands, stall=0.1, stall_time=(0.1, 0.1))
     left, last = np.zeros((ARENAS, ROBOTS), int), np.zeros((ARENAS, ROBOTS))
     for n in range(steps):
@@ -511,20 +514,20 @@ def test_a_stall_keeps_the_last_command(xp: ModuleType) -> None:
         left = np.maximum(left - 1, 0)
         np.testing.assert_allclose(wheels[n, ..., 0], last, rtol=1e-6)  # float32
     stalled = np.diff(wheels[..., 0], axis=0, prepend=0.0) == 0.0
-    assert (stalled.sum(axis=0) >= 3).all()  # it did occur to every robot
+    assert (stalled.sum(axis=0) >= 3).all()  # every robot has stalled
     assert memory.motor is not None
     assert memory.motor.queue is None
     assert memory.infrared is None
     assert memory.seen is None
 
 
-# --- all together, as training and the judge have them
+# --- all factors together, as in training and in the judge
 
 
 def _live(
     electronics: Electronics, memory: Memory | None, found: Factors, clock: Any, xp: Any
 ) -> tuple[Memory, Any]:
-    """One control step [...] of robots that pass a wall: observations and wheel speeds."""
+    """Runs a control step of robots that pass a wall; returns observations and wheel speeds."""
     nothing = xp.zeros((*clock.shape, ROBOTS), xp.float32)
     n = clock[..., None] + nothing
     ray = (0.025 + 0.01 * xp.sin(0.3 * n))[..., None] + xp.zeros(SENSORS, xp.float32)
@@ -540,7 +543,7 @@ def _live(
 
 @ENCODINGS
 def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
-    """Many arenas along leading axes, as the judge has them, and mapped over, as training."""
+    """Compares arenas along a leading axis, as in the judge, with vmapped ones, as in training."""
     realism = load_train(["realism=real"]).realism
     electronics, seeds = (
         task_electronics.load(TaskConfig(), realism, encoding),
@@ -553,12 +556,12 @@ def test_a_real_robot_is_the_same_in_numpy_and_jax(encoding: Encoding) -> None:
         clock = np.full(16, n, np.int32)
         judged, mine = _live(electronics, judged, found, clock, np)
         trained, theirs = live(trained, found, clock)
-        # Wheel speeds and metres are rounded by float32; log and cos of the noise as well.
+        # The tolerance covers float32, and the rounding of log and cos in the noise.
         np.testing.assert_allclose(theirs, mine, rtol=2e-6, atol=2e-6)
         rows.append(mine)
     jax.tree.map(
         lambda mine, theirs: np.testing.assert_equal(mine.shape, theirs.shape), judged, trained
     )
     rows = np.stack(rows)
-    assert (rows[..., INFRARED] < rows[..., INFRARED].max()).mean() > 0.5  # most see something
-    assert (rows[1:] != rows[:-1]).mean() > 0.5  # and something new
+    assert (rows[..., INFRARED] < rows[..., INFRARED].max()).mean() > 0.5  # most rays see something
+    assert (rows[1:] != rows[:-1]).mean() > 0.5  # and most values change

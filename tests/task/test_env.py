@@ -1,4 +1,4 @@
-"""One arena's rules: arrival, the end of an episode, rewards, and what a broken arena does."""
+"""Tests one arena's rules: arrival, ends of episodes, rewards, and broken arenas."""
 
 import dataclasses
 import functools
@@ -28,7 +28,7 @@ ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
 ARENAS, ROBOTS, OBSTACLES, LIMIT = 8, 3, 2, 16  # of the tiny configuration
 HULL, REACH, RANGE = 0.037, 0.05, 0.04  # m
 METRIC = observation.LAYOUTS["metric"]
-PACE = 0.1256 * 0.032  # m a step at full speed: 4.02 mm
+PACE = 0.1256 * 0.032  # m per step at full speed: 4.02 mm
 AHEAD, STILL = (1.0, 0.0), (-1.0, 0.0)  # actions
 
 
@@ -41,7 +41,7 @@ class Robot(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """Arenas driven for one step limit, without any reset: states [T + 1, A], steps [T, A]."""
+    """Arenas driven for one step limit without a reset: states [T + 1, A] and steps [T, A]."""
 
     state: EnvState
     came: TimeStep
@@ -49,25 +49,27 @@ class Episode(NamedTuple):
     rate: np.ndarray
 
 
-# Arrives after 3 steps: 60, 56, 52, 48 mm. Its neighbour's target is behind a wall.
+# The first robot arrives after 3 steps: it is 60, 56, 52, then 48 mm from its target. The second
+# robot's target is behind a wall.
 ARRIVES = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(-0.2, 0.2, 1.0, (9.0, 9.0), STILL)]
-# Arrive after 3 and 5 steps: the second by 68, 64, 60, 56, 52, 48 mm less 4.
+# The robots arrive after 3 and 5 steps: the second is 70, 66, 62, 58, 54, then 49.9 mm away.
 ALL_ARRIVE = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(0.0, 0.2, 0.0, (0.07, 0.2), AHEAD)]
-# The second meets the first, which has arrived, from the front, and pushes it back.
+# The second robot drives head-on into the first, which has arrived, and pushes it back.
 PUSHED = [Robot(0.0, 0.0, 0.0, (0.06, 0.0), AHEAD), Robot(0.11, 0.0, np.pi, (9.0, 9.0), AHEAD)]
-# The first stands 23 mm from the east wall, the second in the middle of nowhere.
+# The first robot stands 23 mm from the east wall. Nothing is near the other two robots.
 STANDS = [
     Robot(0.34, 0.0, 0.0, (0.0, 0.3), STILL),
     Robot(-0.1, 0.0, 0.0, (-0.3, 0.3), STILL),
     Robot(0.1, -0.25, 0.0, (-0.3, 0.0), STILL),
 ]
-# The first drives into the east wall, the second into an obstacle.
+# The first robot drives into the east wall, and the second into an obstacle.
 BUMPS = [
     Robot(0.34, 0.0, 0.0, (0.0, 0.3), AHEAD),
     Robot(-0.05, -0.25, np.pi, (0.3, -0.25), AHEAD),
 ]
 OBSTACLE = (-0.2, -0.25, 0.0, 0.05, 0.05)
-# Arrives in the very step in which time runs out: 50 mm and 15.5 steps.
+# The first robot arrives in the very step in which time runs out: its target is 50 mm and 15.5
+# steps of driving away.
 JUST_IN_TIME = [
     Robot(0.0, 0.0, 0.0, (REACH + 15.5 * PACE, 0.0), AHEAD),
     Robot(0.0, 0.2, 0.0, (9.0, 9.0), STILL),
@@ -77,7 +79,7 @@ ARRIVING, ALL, PUSHING, STANDING, BUMPING, ENDING, *RANDOM = range(ARENAS)
 
 
 def _level(robots: list[Robot]) -> Level:
-    """An arena of 0.8 m with these robots and one obstacle, the rest parked."""
+    """Returns a level 0.8 m wide with the given robots and one obstacle, the rest parked."""
     parked = [Robot(5.0 + 0.5 * i, 5.0, 0.0, (5.0 + 0.5 * i, 5.0), AHEAD) for i in range(ROBOTS)]
     everyone = [*robots, *parked[len(robots) :]]
     return Level(
@@ -92,7 +94,7 @@ def _level(robots: list[Robot]) -> Level:
 
 
 def _crowd(random: np.random.Generator) -> list[Robot]:
-    """Three robots close to each other, whose actions are drawn anew at every step."""
+    """Returns three robots close to each other; `actions` draws their actions for each step."""
     place = [(-0.05, 0.0), (0.05, 0.0), (0.0, 0.09)]
     return [Robot(x, y, random.uniform(-3, 3), (0.1, 0.06), AHEAD) for x, y in place]
 
@@ -105,7 +107,7 @@ def _start(world: World, levels: list[Level]) -> EnvState:
 
 
 def _slim(state: EnvState) -> EnvState:
-    """The state as NumPy, with no more of the physics than a checkpoint holds."""
+    """Returns the state in NumPy, with only those parts of the physics that checkpoints hold."""
     return jax.tree.map(np.asarray, dataclasses.replace(state, sim=physics.pack(state.sim)))
 
 
@@ -158,13 +160,13 @@ def test_a_robot_arrives_once_and_its_own_episode_ends(episode: Episode) -> None
     assert came.valid[:, *robot].tolist() == [t <= 2 for t in range(LIMIT)]
     assert not came.reward[3:, *robot].any()
     assert not came.truncated[:, *robot].any()
-    # 60 mm less three steps, 1e-6 m for float32.
+    # The distance is 60 mm less three steps; 1e-6 m covers float32.
     assert episode.state.distance[3, *robot] == pytest.approx(0.06 - 3 * PACE, abs=1e-6)
 
 
 def test_a_robot_that_has_arrived_stands_whatever_its_action(episode: Episode) -> None:
     rate = episode.rate[:, ARRIVING, 0]
-    # 1e-6: float32; it drives until it arrives, and its servo is deadbeat.
+    # It drives until it arrives, then stops at once, since its servo is deadbeat. 1e-6: float32.
     np.testing.assert_allclose(rate[1:4, 0], 0.1256, atol=1e-6)
     np.testing.assert_allclose(rate[4:], 0.0, atol=1e-6)
     place = episode.pose[:, ARRIVING, 0]
@@ -174,7 +176,7 @@ def test_a_robot_that_has_arrived_stands_whatever_its_action(episode: Episode) -
 def test_a_robot_that_is_pushed_away_has_still_arrived(episode: Episode) -> None:
     robot = PUSHING, 0
     assert episode.came.terminated[:, *robot].tolist() == [t == 2 for t in range(LIMIT)]
-    assert episode.state.distance[-1, *robot] > REACH + 0.01  # it was pushed a centimetre out
+    assert episode.state.distance[-1, *robot] > REACH + 0.01  # pushed out by over a centimetre
     assert episode.state.arrived[3:, *robot].all()
     assert not episode.came.valid[3:, *robot].any()
     assert not episode.came.reward[3:, *robot].any()
@@ -202,8 +204,8 @@ def test_what_was_seen_before_follows_what_is_seen_now(
     nothing = np.zeros_like(single[0])
     for t in range(6):
         before = [single[t - age] if t >= age else nothing for age in range(3)]
-        # Two programs, whose float32 may differ in the last bits; distances are up to 1 m, absent
-        # robots 7 m away.
+        # Two programs may differ in the last bits of float32. Distances are up to 1 m, and absent
+        # robots are 7 m away.
         expected = np.concatenate(before, axis=-1)
         np.testing.assert_allclose(state.observation, expected, rtol=0, atol=2e-5)
         state, came = step(state, jnp.asarray(actions[t]))
@@ -246,7 +248,7 @@ def test_absent_robots_take_no_part(episode: Episode) -> None:
         assert not getattr(episode.came, name)[:, absent].any(), name
     for total in episode.state.episode:
         assert not total[-1][absent].any()
-    # They stand where they are parked, whatever their action.
+    # Absent robots stay where they are parked, whatever their action.
     np.testing.assert_array_equal(
         episode.pose[:, absent], np.broadcast_to(episode.pose[0][absent], (LIMIT + 1, 5, 3))
     )
@@ -265,10 +267,11 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
             distance, bearing = observation.to_target(pose, target, np)
             expected = observation.observe(Readings(seen, distance, bearing), METRIC, np)
             found = episode.came.observation[t, a]
-            # 1e-5 m: float32, where a glancing ray multiplies its rounding.
+            # 1e-5 m covers float32 rounding, which a glancing ray multiplies.
             rest = KNOWN[KNOWN != BEARING]
             np.testing.assert_allclose(found[:, rest], expected[:, rest], atol=1e-5)
-            # Where the target is near, so is its rounding in rad; half a turn is either sign.
+            # Bearings are compared on the unit circle, since half a turn may have either sign. An
+            # absent robot stands on its target, where rounding decides the bearing.
             turn = np.abs(np.exp(1j * found[:, BEARING]) - np.exp(1j * expected[:, BEARING]))
             present = level.present[0, a]
             assert (turn < 1e-5)[present].all()
@@ -282,11 +285,11 @@ def test_first_observation(tiny_world: World, start: EnvState) -> None:
         level.start[STANDING], level.side[STANDING], level.obstacle[STANDING], HULL, RANGE, np
     )
     np.testing.assert_allclose(found[:, INFRARED], expected, atol=1e-6)  # float32
-    # The first robot looks at the wall, 60 mm ahead of its centre: ps7 sits 30 mm ahead and
-    # looks 0.2992 rad to the left, ps0 0.30081 rad to the right.
+    # The first robot faces the wall, 60 mm ahead of its centre. Its ps7 and ps0 sit 30 mm ahead;
+    # ps7 looks 0.2992 rad to the left, and ps0 looks 0.30081 rad to the right.
     assert found[0, INFRARED][7] == pytest.approx(0.03 / np.cos(0.2992), abs=1e-6)
     assert found[0, INFRARED][0] == pytest.approx(0.03 / np.cos(0.30081), abs=1e-6)
-    # Its target is 0.34 m back and 0.3 m to the left.
+    # The first robot's target is 0.34 m behind it and 0.3 m to the left.
     assert found[0, DISTANCE] == pytest.approx(np.hypot(0.34, 0.3), abs=1e-6)
     assert found[0, BEARING] == pytest.approx(np.arctan2(0.3, -0.34), abs=1e-6)
     assert int(state.clock) == 0
@@ -298,16 +301,16 @@ def test_first_observation(tiny_world: World, start: EnvState) -> None:
 
 
 def test_a_robot_that_stands_in_range_pays_every_step_once(episode: Episode) -> None:
-    # Two rays of the first see the wall; the others see nothing.
+    # Two rays of the first robot see the wall; the other robots see nothing.
     assert (episode.came.observation[:, STANDING, 0, INFRARED] < RANGE).sum(axis=-1).min() == 2
     expected = np.broadcast_to(np.float32([-0.001, 0.0, 0.0]), (LIMIT, ROBOTS))
-    # 1e-7 m: its distance to the target is computed anew at every step.
+    # 1e-7 m covers rounding: the distance to the target is recomputed at every step.
     np.testing.assert_allclose(episode.came.reward[:, STANDING], expected, atol=1e-7)
     assert episode.state.episode.sensed[-1, STANDING].tolist() == [LIMIT, 0, 0]
 
 
 def test_rewards_of_an_episode_add_up_to_the_way_made(episode: Episode) -> None:
-    """With progress only, they telescope; each step in range costs 0.001 beside."""
+    """Progress rewards telescope; each step with something in range costs a further 0.001."""
     present = episode.state.level.present[0]
     ended = np.where(
         episode.came.terminated.any(axis=0), episode.came.terminated.argmax(axis=0), 15
@@ -318,7 +321,7 @@ def test_rewards_of_an_episode_add_up_to_the_way_made(episode: Episode) -> None:
     steps = np.sum(sensed & episode.came.valid, axis=0)
     expected = np.where(present, progress - 0.001 * steps, 0.0)
     assert (steps[RANDOM] > 0).any()
-    # 1e-6: float32, sixteen sums.
+    # 1e-6 covers sixteen sums in float32.
     np.testing.assert_allclose(episode.came.reward.sum(axis=0), expected, atol=1e-6)
     np.testing.assert_allclose(episode.state.episode.reward[-1], expected, atol=1e-6)
     np.testing.assert_array_equal(episode.state.episode.sensed[-1], np.where(present, steps, 0))
@@ -334,12 +337,13 @@ def test_steps_before_arrival_are_counted(episode: Episode) -> None:
 def test_contacts_are_counted_by_kind(episode: Episode) -> None:
     counts = episode.state.episode.contacts[-1]
     assert gaps.KINDS == ("robot", "obstacle", "wall")
-    # Into a wall 23 mm ahead, and into an obstacle: once each, while they keep pushing.
+    # One robot meets a wall 23 mm ahead, and another an obstacle. Each contact counts once,
+    # although the robots keep pushing.
     assert counts[BUMPING].tolist() == [[0, 0, 1], [0, 1, 0], [0, 0, 0]]
-    # A contact of two robots is one of each, arrived or not.
+    # A contact of two robots counts once for each of them, even for one that has arrived.
     assert counts[PUSHING].tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 0]]
     assert not counts[STANDING].any()
-    # All of them again, from the poses.
+    # The poses must give the same counts.
     apart = np.full((ARENAS, ROBOTS, 3), gaps.CONTACT_PAUSE)
     expected = np.zeros((ARENAS, ROBOTS, 3), int)
     level = jax.tree.map(lambda field: field[0], episode.state.level)
@@ -356,7 +360,7 @@ def test_contacts_are_counted_by_kind(episode: Episode) -> None:
 def _priced(
     world: World, start: EnvState, actions: np.ndarray, arena: int, **weights: float
 ) -> env.TimeStep:
-    """Drives one arena again, with other weights of the reward."""
+    """Drives one arena again with other reward weights, and returns its steps."""
     task = world.task
     priced = dataclasses.replace(task, reward=dataclasses.replace(task.reward, **weights))
     step = functools.partial(env.step, dataclasses.replace(world, task=priced))
@@ -370,7 +374,7 @@ def test_a_contact_of_robots_is_charged_to_the_one_on_its_way(
 ) -> None:
     came = _priced(tiny_world, start, actions, PUSHING, robot_contact=-0.5)
     charged = np.asarray(came.reward) - episode.came.reward[:, PUSHING]
-    # 1e-5: another program, whose roundings contacts multiply.
+    # 1e-5 covers the rounding of another program, which contacts multiply.
     np.testing.assert_allclose(charged.sum(axis=0), [0.0, -0.5, 0.0], atol=1e-5)
 
 
@@ -385,7 +389,7 @@ def test_leaning_is_charged_in_every_step(
     leans = (gap <= 0.0).any(axis=-1) & np.asarray(came.valid)
     assert leans.sum(axis=0)[0] > 5, "it keeps pushing"
     charged = np.asarray(came.reward) - episode.came.reward[:, BUMPING]
-    # 1e-5: another program, whose roundings contacts multiply.
+    # 1e-5 covers the rounding of another program, which contacts multiply.
     np.testing.assert_allclose(charged, -0.5 * leans, atol=1e-5)
 
 
@@ -396,7 +400,8 @@ def test_leaning_is_charged_in_every_step(
 def test_an_arena_moves_as_it_would_in_any_other_company(
     start: EnvState, actions: np.ndarray, episode: Episode, tiny_step: ArenaStep, arena: int
 ) -> None:
-    # Eight copies of one arena, in the same program: bit for bit what it did among the others.
+    # Eight copies of one arena, run by the same program, repeat bit for bit what the arena did
+    # among other arenas.
     state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[arena], leaf.shape), start)
     for t, action in enumerate(actions):
         mine = np.broadcast_to(action[arena], action.shape)
@@ -443,13 +448,13 @@ def test_a_broken_arena_is_over_and_teaches_nothing(
     assert came.truncated[BUMPING].tolist() == [True, True, False]
     assert not came.reward[BUMPING].any()
     assert np.isfinite(came.observation).all()
-    np.testing.assert_array_equal(state.distance[BUMPING], before)  # seen where it last was
+    np.testing.assert_array_equal(state.distance[BUMPING], before)  # it keeps its last distance
     for total in state.episode:
         assert np.isfinite(total).all()
 
 
 def _spoil(state: EnvState, field: str, value: float) -> EnvState:
-    """Puts a value into what the first robot of an arena brings along."""
+    """Sets the last distance or the target of the first robot in one arena to a value."""
     if field == "target":
         level = state.level._replace(target=state.level.target.at[BUMPING, 0, 1].set(value))
         return dataclasses.replace(state, level=level)
@@ -470,7 +475,7 @@ def test_an_arena_breaks_by_what_is_seen_and_earned_as_well(
     assert came.truncated[BUMPING].tolist() == [True, True, False]
     assert np.isfinite(came.reward).all()
     assert np.isfinite(broken.episode.reward).all()
-    # What was seen last.
+    # The broken arena keeps its last observation.
     np.testing.assert_array_equal(came.observation[BUMPING], start.observation[BUMPING])
     others = np.arange(ARENAS) != BUMPING
     jax.tree.map(
@@ -494,7 +499,7 @@ def test_what_an_absent_robot_sees_breaks_nothing(
 
 
 class Drawn(NamedTuple):
-    """Real robots: a program that moves and restarts arenas, and where it was traced."""
+    """Arenas of realistic robots, a program that steps and restarts them, and its traces."""
 
     world: World
     start: Arena
@@ -507,7 +512,7 @@ FEW, LIFE = 4, 40  # arenas, and control steps of an episode
 
 @pytest.fixture(scope="module")
 def real() -> Drawn:
-    """Two robots that drive about an obstacle, with all that realism makes of them."""
+    """Returns arenas of two robots and one obstacle, with all factors of `realism=real`."""
     arena = ["stage=s2", "stage.obstacles=1", "sim.max_robots=3", "sim.max_obstacles=1"]
     size = [f"arenas={FEW}", f"task.step_limit={LIFE}", "algo.num_minibatches=2", "budget=1000000"]
     config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
@@ -540,11 +545,11 @@ def test_real_robots_drive_for_many_episodes(real: Drawn) -> None:
         assert np.asarray(came.sound).all()
         for leaf in jax.tree.leaves((_slim(state), came)):
             assert np.isfinite(leaf).all()
-    # One trace: what is None stays None, and every array keeps its shape and kind.
+    # JAX traces once: each None stays None, and each array keeps its shape and dtype.
     assert real.traces == [before]
     assert jax.tree.structure(state) == before
     assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), state) == kinds
-    # Time runs out every 40 steps, or all arrive before.
+    # An episode ends after 40 steps, or earlier when all robots have arrived.
     assert (np.sum(ended, axis=0) >= 200 // LIFE).all()
     assert (cohorts[0] == 0).all()
     assert (cohorts[-1] == 1).all()
@@ -558,18 +563,18 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     assert after.clock.tolist() == [1, 0, 1, 0]
     new = np.asarray(came.done)
     np.testing.assert_array_equal(after.level.seed != state.level.seed, new)
-    np.testing.assert_array_equal(after.cohort, new)  # that of the waiting ones is 1
+    np.testing.assert_array_equal(after.cohort, new)  # waiting levels are of cohort 1
     seeds, world = np.asarray(after.level.seed), real.world
     expected = task_factors.draw(seeds, world.realism, world.robot, 3, 1, np)
     for name, found, mine in zip(expected._fields, after.factors, expected, strict=True):
-        if name == "hull_friction":  # `real` leaves hulls smooth
+        if name == "hull_friction":  # `realism=real` leaves hulls smooth
             continue
         assert found is not None
         assert mine is not None
-        # The rounding of low + u * (high - low), and of log and cos.
+        # The tolerance covers the rounding of low + u * (high - low), and of log and cos.
         np.testing.assert_allclose(found, mine, rtol=2e-6, atol=1e-6)
-    # Nothing of the old episode is under way: no command was sent, and all that has been seen is
-    # what is seen now.
+    # Nothing of the old episode is left: no command is queued or held, and the stored observations
+    # are the current one.
     motor, infrared, seen = jax.tree.map(np.asarray, after.memory)
     assert motor.queue[~new, 0].all()
     assert not motor.queue[new].any()

@@ -1,4 +1,4 @@
-"""The environment stands alone: no trainer, no learner and no curriculum is behind it."""
+"""Tests that the environment imports no trainer, no learner and no curriculum."""
 
 import subprocess
 import sys

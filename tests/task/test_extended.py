@@ -1,4 +1,4 @@
-"""What pieces of somebody's own do in an arena, and how those that do not fit are refused."""
+"""Tests what a user's extensions do in an arena, and how unfit extensions are refused."""
 
 import dataclasses
 from functools import partial
@@ -62,7 +62,7 @@ def test_an_observation_follows_the_built_in_ones(world: World, drawn: level.Lev
 
 def test_a_term_has_its_weight(world: World, drawn: level.Level) -> None:
     action = np.zeros((4, 2), np.float32)
-    action[:, 1] = [0.5, -1.0, 7.0, 1.0]  # what is beyond 1 is clipped; the last one is absent
+    action[:, 1] = [0.5, -1.0, 7.0, 1.0]  # 7.0 is clipped to 1; the last robot is absent
     came = _step(world, drawn, action)[1]
     np.testing.assert_allclose(came.reward, WEIGHT * np.array([0.25, 1.0, 1.0, 0.0]), rtol=1e-6)
 
@@ -81,7 +81,7 @@ def test_the_judge_draws_the_same_level(world: World) -> None:
     uniforms = np.random.default_rng([5, 2]).random(level.uniform_count(world.spacing), np.float32)
     mine = extended.draw(uniforms, stage, world.spacing, world.drawings)
     for one, other in zip(theirs, mine, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6)  # XLA fuses, and rounds otherwise
+        np.testing.assert_allclose(one, other, atol=1e-6)  # XLA's fusion changes the rounding
 
 
 def test_other_stages_are_drawn_as_without_the_piece(world: World) -> None:
@@ -192,7 +192,7 @@ def there(view):
 
 @pytest.mark.parametrize("rule", ["latch", "hold"])
 def test_pieces_see_who_is_there_by_either_rule(tmp_path: Path, rule: Arrival) -> None:
-    """One robot stands at its target and one has far to go; then the first has left it again."""
+    """Starts one robot at its target and one far from its own, then moves the first target away."""
     file = extensions.write(tmp_path / "own.py", BY_RULE)
     price = RewardConfig(progress=0.0, contact=0.0, step_penalty=0.0, extra={"away": 1.0})
     pair = StageConfig(name="pair", robots=2, side=0.8)
@@ -209,6 +209,6 @@ def test_pieces_see_who_is_there_by_either_rule(tmp_path: Path, rule: Arrival) -
     state, third = step(state, still)
     there = [each.observation[0, -1] for each in (first, second, third)]
     earned = [each.reward[0] for each in (first, second, third)]
-    # By latch it has arrived in the first step, which says so, and then earns nothing.
+    # With latch, the robot arrives in the first step, is paid for it, and then earns nothing.
     assert there == ([1, 1, 1] if rule == "latch" else [1, 0, 0])
     assert earned == ([11, 0, 0] if rule == "latch" else [1, 0, 1])

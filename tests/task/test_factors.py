@@ -1,4 +1,4 @@
-"""The factors of an episode: which there are, from where they are drawn, and what they share."""
+"""Tests the factors of an episode: their presence, distributions and independence."""
 
 import dataclasses
 import math
@@ -18,12 +18,13 @@ from swarmjax.task.factors import Factors
 ROBOT = RobotConfig()
 ROBOTS, SENSORS, OBSTACLES = 5, 8, 3
 SEEDS = np.arange(10_000, dtype=np.uint32)
-# Two-sided probability 1e-5 of a standard normal number: a fair generator fails so rarely.
+# A standard normal number lies beyond +-4.42 with probability 1e-5, so a fair generator rarely
+# fails.
 FAR = 4.42
-# float32 may round low + u * (high - low) differently where XLA multiplies and adds at once.
+# XLA may fuse the product and the sum in low + u * (high - low), which changes float32 rounding.
 ROUNDING = 3e-7
 
-# Every factor: what switches it on, the field that it makes, and that field's shape.
+# For every factor, the setting that switches it on, its field, and the field's shape.
 RANGES: dict[str, Any] = {
     "wheel_radius": (0.0198, 0.0207),
     "track": (0.052, 0.0575),
@@ -93,17 +94,17 @@ def _draw(realism: RealismConfig, seed: Any = SEEDS, robots: int = ROBOTS) -> Fa
 
 
 def _on(found: Factors) -> set[str]:
-    """Names of the fields that are there."""
+    """Returns the names of the fields that are not None."""
     return {name for name, value in found._asdict().items() if value is not None}
 
 
 @pytest.fixture(scope="module")
 def drawn() -> Factors:
-    """Every factor, of 10,000 episodes."""
+    """Returns all factors of 10,000 episodes."""
     return _draw(ALL)
 
 
-# --- which factors there are
+# --- which factors are present
 
 
 def test_with_everything_off_there_is_nothing() -> None:
@@ -140,14 +141,14 @@ def test_what_is_not_random_needs_no_seed(settings: dict[str, Any]) -> None:
 @pytest.mark.parametrize("name", EPISODE)
 def test_switching_a_factor_off_leaves_the_others_alone(name: str, drawn: Factors) -> None:
     without = _draw(dataclasses.replace(ALL, **{name: None}))
-    # The two settings of the wheels share a field.
+    # Wheel radius and wheel mismatch share a field.
     gone = set() if FIELDS[name] == "wheel_radius" else {FIELDS[name]}
     assert _on(without) == set(Factors._fields) - gone
     for field in set(Factors._fields) - {FIELDS[name]}:
         np.testing.assert_array_equal(getattr(without, field), getattr(drawn, field), field)
 
 
-# --- shapes, types, and the same in both modules
+# --- shapes, types, and agreement of NumPy and JAX
 
 
 def test_shapes_and_types(drawn: Factors) -> None:
@@ -173,7 +174,8 @@ def test_numpy_and_jax_draw_the_same_factors(drawn: Factors) -> None:
             if expected.dtype != np.float32:
                 np.testing.assert_array_equal(value, expected, name)
                 continue
-            # A normal number differs by 2e-6 of its deviation (tests/sim/test_noise.py).
+            # Normal numbers of NumPy and JAX differ by up to 2e-6 of their deviation, see
+            # tests/sim/test_noise.py.
             scale = DEVIATIONS.get(name, 0.005 if name == "wheel_radius" else 0.0)
             np.testing.assert_allclose(
                 value, expected, rtol=ROUNDING, atol=2e-6 * scale, err_msg=name
@@ -194,12 +196,12 @@ def test_more_robots_leave_the_first_alone() -> None:
         if shape[:1] == (ROBOTS,):
             more = getattr(many, name)
             assert more.shape[1] == 12, name
-            # As above.
+            # NumPy's log and cos differ in the last bits, as above.
             scale = 2e-6 * DEVIATIONS.get(name, 0.005 if name == "wheel_radius" else 0.0)
             np.testing.assert_allclose(getattr(few, name), more[:, :ROBOTS], rtol=0, atol=scale)
 
 
-# --- from where they are drawn
+# --- distributions
 
 
 @pytest.mark.parametrize("name", RANGES)
@@ -207,25 +209,25 @@ def test_a_range_is_drawn_from_evenly(name: str) -> None:
     low, high = RANGES[name]
     found = getattr(_draw(_realism(**{name: RANGES[name]})), name).astype(float)
     if name == "wheel_radius":
-        found = found[..., 0]  # both wheels are alike
+        found = found[..., 0]  # both wheels are equal
     count = found.size
     assert found.min() >= low * (1 - ROUNDING)
     assert found.max() <= high * (1 + ROUNDING)
     share = ((found - low) / (high - low)).reshape(-1)
-    # Deviations of the mean and of the squared distance from the middle: 1/12 and 1/180.
+    # The variances of a share and of its squared distance from the middle are 1/12 and 1/180.
     assert abs(share.mean() - 0.5) < FAR * math.sqrt(1 / 12 / count)
     assert abs(((share - 0.5) ** 2).mean() - 1 / 12) < FAR * math.sqrt(1 / 180 / count)
     counts = np.histogram(np.clip(share, 0, 1), bins=20, range=(0, 1))[0]
-    assert stats.chisquare(counts).pvalue > 1e-5  # a fair generator fails so rarely
+    assert stats.chisquare(counts).pvalue > 1e-5  # a fair generator rarely fails
 
 
 @pytest.mark.parametrize("name", DEVIATIONS)
 def test_a_deviation_is_that_of_a_normal_number(name: str, drawn: Factors) -> None:
     found = getattr(drawn, name).astype(float).reshape(-1) / DEVIATIONS[name]
-    # Deviations of the means of z and z**2: sqrt of 1 and 2 over n.
+    # The standard errors of the means of z and z**2 are sqrt(1 / n) and sqrt(2 / n).
     assert abs(found.mean()) < FAR / math.sqrt(found.size)
     assert abs((found**2).mean() - 1.0) < FAR * math.sqrt(2 / found.size)
-    assert stats.kstest(found, "norm").pvalue > 1e-5  # a fair generator fails so rarely
+    assert stats.kstest(found, "norm").pvalue > 1e-5  # a fair generator rarely fails
 
 
 @pytest.mark.parametrize("name", LATENCIES)
@@ -277,11 +279,11 @@ def test_the_mismatch_is_the_relative_difference_of_the_wheels(bounds: Any) -> N
     else:
         alone = np.asarray(_draw(_realism(wheel_radius=bounds)).wheel_radius)
         base = alone[..., 0].astype(float)
-    # 1e-7: float32's digits; the two wheels differ from the base by the same.
+    # Both wheels differ from the base radius by the same amount. 1e-7 covers float32.
     np.testing.assert_allclose(mean, base, rtol=1e-7)
     relative = difference / mean / 0.005
     count = relative.size
-    # Deviations of the means of z and z**2: sqrt of 1 and 2 over n.
+    # The standard errors of the means of z and z**2 are sqrt(1 / n) and sqrt(2 / n).
     assert abs(relative.mean()) < FAR / math.sqrt(count)
     assert abs((relative**2).mean() - 1.0) < FAR * math.sqrt(2 / count)
 
@@ -296,7 +298,8 @@ def test_no_draw_exceeds_the_largest_wheels() -> None:
     assert factors.largest(ROBOT, RealismConfig()) == ROBOT
     wide = factors.largest(ROBOT, _realism(wheel_radius=(0.0198, 0.0207)))
     assert wide == dataclasses.replace(ROBOT, wheel_radius=0.0207)
-    # The largest of all normal numbers, half of it for a wheel: 0.5 * 0.1 * 5.7681 = 0.288405.
+    # The largest normal number is 5.7681, and half of it acts on each wheel:
+    # 0.5 * 0.1 * 5.7681 = 0.288405.
     most = factors.largest(ROBOT, _realism(wheel_radius=(0.0198, 0.02), wheel_mismatch=0.1))
     assert most.wheel_radius == pytest.approx(0.02 * 1.288405, rel=1e-6)
     radius = np.asarray(_draw(_realism(wheel_mismatch=0.1)).wheel_radius)
@@ -305,11 +308,11 @@ def test_no_draw_exceeds_the_largest_wheels() -> None:
     assert 0.02 * (1 + 0.05 * 3.5) < radius.max() < limit
 
 
-# --- what they share
+# --- independence
 
 
 def test_robots_sensors_axes_and_factors_know_nothing_of_each_other(drawn: Factors) -> None:
-    # One column for each number of an episode; those of a robot's wheels by mean and difference.
+    # Each number of an episode has a column. A robot's wheels enter as mean and difference.
     wheels = np.asarray(drawn.wheel_radius).astype(float)
     parts = [wheels.mean(axis=-1), wheels[..., 1] - wheels[..., 0]]
     parts += [
@@ -321,7 +324,8 @@ def test_robots_sensors_axes_and_factors_know_nothing_of_each_other(drawn: Facto
     correlation = np.corrcoef(columns.T)
     pairs = np.abs(correlation[np.triu_indices(len(correlation), 1)])
     assert len(pairs) > 40_000
-    # 6 deviations of 1 / sqrt(n): the worst of 45,000 passes them with probability 1e-4.
+    # The bound is 6 standard errors of 1 / sqrt(n). The largest of 45,000 exceeds it with
+    # probability 1e-4.
     assert pairs.max() < 6.0 / math.sqrt(len(SEEDS))
 
 

@@ -1,4 +1,4 @@
-"""The paper's fixed level, worked out by hand for the example's arena and for one of 1.2 m."""
+"""Tests the paper's fixed level by hand, in the example's arena and in an arena of 1.2 m."""
 
 import contextlib
 import itertools
@@ -74,12 +74,12 @@ def test_fence_is_one_obstacle(side: float, expected: tuple[float, ...], obstacl
     found = _level(_stage(side, 2, obstacles, "fence"))
     assert found.obstacle_present.tolist() == [True, False, False, False]
     np.testing.assert_allclose(found.obstacle[0], expected, atol=TOLERANCE)
-    # It begins at the west wall, as in the example.
+    # The fence begins at the west wall, as in the example.
     assert found.obstacle[0, 0] - found.obstacle[0, 3] == pytest.approx(-side / 2, abs=TOLERANCE)
 
 
 def _accepted() -> list[StageConfig]:
-    """Stages of the shipped sizes, either layout, that fit their arena."""
+    """Returns stages of the shipped sizes, in either layout, that fit their arena."""
     stages = []
     for side, robots, layout in itertools.product(SIDES, (2, 3, 5), LAYOUTS):
         for obstacles in range(5) if layout == "boxes" else (1,):
@@ -107,7 +107,8 @@ def test_nothing_overlaps(stage: StageConfig) -> None:
 def test_a_robot_passes_between_the_boxes_of_larger_arenas(side: float) -> None:
     found = _level(_stage(side, 2, 4, "boxes"))
     centre = found.obstacle[:, :2]
-    # Boxes of 0.1 m that are not turned: the gap is the larger one along either axis, or wider.
+    # The boxes are 0.1 m wide and not turned. The gap between two boxes is therefore at least the
+    # larger of their gaps along x and along y.
     apart = np.abs(centre[:, None] - centre[None]).max(axis=-1) - 0.1
     assert (apart[~np.eye(4, dtype=bool)] >= 0.1).all()
     assert (0.5 * side - np.abs(centre) - 0.05 >= 0.1).all()
@@ -117,7 +118,7 @@ def test_a_robot_passes_between_the_boxes_of_larger_arenas(side: float) -> None:
 def test_row_of_starts_holds_most_robots(side: float) -> None:
     most = fixed_level.most_robots(side)
     x = fixed_level.starts(most + 1, np.float32(side), np)[:, 0]
-    # The wall on the right leaves the last one a hull and 23 mm, and the next one less.
+    # The last robot keeps a hull and 23 mm from the right wall; one more robot would keep less.
     assert x[most - 1] <= 0.5 * side - 0.06 + TOLERANCE
     assert x[most] > 0.5 * side - 0.06 - TOLERANCE
 
@@ -126,14 +127,14 @@ def test_row_of_starts_holds_most_robots(side: float) -> None:
 def test_nothing_is_drawn_and_numpy_and_jax_agree(layout: Layout) -> None:
     stage = _stage(1.2, 3, 2, layout)
     expected = _level(stage, 0.1)
-    # The seed of all that is not the layout is drawn all the same.
+    # The last field, the seed, is left out, since it is drawn even in a fixed level.
     for mine, theirs in zip(_level(stage, 0.9)[:-1], expected[:-1], strict=True):
         np.testing.assert_array_equal(mine, theirs)
     single = jax.tree.map(jnp.asarray, task_stage.select(task_stage.stack([stage]), 0))
     uniforms = jnp.full(level.uniform_count(SPACING), 0.3)
     found = level.sample(uniforms, single, SPACING, jnp)
     for mine, theirs in zip(found[:-1], expected[:-1], strict=True):
-        # float32 products that XLA may round differently; one ulp at the parking, 5 m.
+        # XLA may round float32 products differently: one ulp at 5 m, where robots are parked.
         np.testing.assert_allclose(mine, theirs, atol=5e-7)
 
 

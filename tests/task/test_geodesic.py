@@ -1,4 +1,4 @@
-"""Shortest paths around walls and boxes: by hand, against the judge's, and as a reward."""
+"""Tests shortest paths around walls and boxes by hand, against the judge and as a reward."""
 
 import dataclasses
 from functools import partial
@@ -21,9 +21,9 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 
 HULL = 0.037  # m
-CORNER = 0.9 * HULL  # how far off an obstacle paths turn, in x and in y
+CORNER = 0.9 * HULL  # m, in x and in y, from an obstacle to a turn of a path
 TARGET = 0.05  # m
-# m; float32, sums of a few lengths of about 1.
+# m; covers float32 sums of a few lengths of about 1 m.
 ROUND = 1e-6
 # A wall of 0.4 m from south to north, between a robot in the west and a target in the east.
 WALL = [0.0, 0.0, 0.0, 0.01, 0.2]
@@ -60,14 +60,14 @@ def test_the_path_turns_at_the_near_end_of_a_wall(quarters: int) -> None:
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     start, target = (list(rotation @ place) for place in ([-0.3, 0.1], [0.3, 0.1]))
     wall = [0.0, 0.0, turn, *WALL[3:]]
-    # To (0.01 + CORNER, 0.2 + CORNER) on either side of the wall, and past its end between them.
+    # The path turns on both sides of the wall's end: at x = +-(0.01 + CORNER), y = 0.2 + CORNER.
     across, up = 0.01 + CORNER, 0.2 + CORNER - 0.1
     expected = 2.0 * np.hypot(0.3 - across, up) + 2.0 * across
     assert _distance(_level(start, target, [wall])) == pytest.approx(expected, abs=ROUND)
 
 
 def test_a_gap_too_narrow_for_a_robot_is_no_way() -> None:
-    # Two boxes in line leave 5 cm between them.
+    # The two boxes are in line and leave a gap of 5 cm.
     north, south = [0.0, 0.475, 0.0, 0.01, 0.025], [0.0, -0.05, 0.0, 0.01, 0.45]
     drawn = _level([-0.3, 0.3], [0.3, 0.3], [north, south])
     found = jax.jit(partial(geodesic.survey, hull_radius=HULL))(drawn)
@@ -93,7 +93,7 @@ def test_a_robot_without_a_path_keeps_its_distance() -> None:
 
 @pytest.fixture(scope="module", params=["trap", "fence", "maze", "clutter"])
 def drawn(request: pytest.FixtureRequest) -> Level:
-    """Thirty levels of a family."""
+    """Returns thirty levels of one family of stages."""
     settings = load_train([f"stage=world_{request.param}", "arenas=8"])
     program, schedule = programs.load(settings)
     spacing = program.world.spacing
@@ -109,14 +109,15 @@ def test_paths_are_as_long_as_those_of_the_judge(drawn: Level) -> None:
     exact = shortest(drawn.side, places, drawn.target, drawn.obstacle, HULL, TARGET)
     there = np.asarray(drawn.present) & np.isfinite(exact)
     longer = (np.asarray(found) - TARGET - exact)[there]
-    # Obstacles are widened by 0.8 of the hull, 7 mm less than it takes, and have square corners:
-    # a turn by a right angle is up to 2 - pi / 2 of 0.9 hulls longer, 14 mm. Paths have few turns.
+    # Obstacles are widened by 0.8 of the hull's radius, which is 7 mm too little, and have square
+    # corners. A turn by a right angle is therefore up to 2 - pi / 2 of 0.9 radii longer, 14 mm.
+    # Paths have few turns.
     assert longer.min() > -2e-3
     assert longer.max() < 0.04
 
 
 class Driven(NamedTuple):
-    """A world whose reward is progress along the path alone, and an episode in it."""
+    """The first and last state of an episode, and its rewards, which are path progress alone."""
 
     began: env.EnvState
     ended: env.EnvState
@@ -125,7 +126,7 @@ class Driven(NamedTuple):
 
 @pytest.fixture(scope="module")
 def driven() -> Driven:
-    """A robot that wriggles in front of a wall for 40 steps."""
+    """Drives a robot by random actions for 40 steps in front of a wall."""
     weights = RewardConfig(progress=0.0, path_progress=2.0, contact=0.0, step_penalty=0.0)
     stage = StageConfig(name="wall", robots=1, side=1.0, obstacles=1)
     sim = SimConfig(impl="jax", max_robots=1, max_obstacles=1)
@@ -147,7 +148,7 @@ def test_rewards_add_up_to_how_much_shorter_the_path_is(driven: Driven) -> None:
     assert driven.ended.path is not None
     shorter = float(driven.began.path.distance[0] - driven.ended.path.distance[0])
     assert abs(shorter) > 1e-3  # it moved
-    # Float32: 40 differences of numbers below 1.
+    # 1e-5 covers 40 float32 differences of numbers below 1.
     assert driven.rewards.sum() == pytest.approx(2.0 * shorter, abs=1e-5)
 
 
@@ -179,7 +180,7 @@ def test_warp_finds_the_same_paths(drawn: Level) -> None:
     begin = partial(geodesic.begin, hull_radius=HULL, fast=paths_warp)
     fast = jax.jit(jax.vmap(begin))(drawn)
     there = np.asarray(drawn.present)
-    # Float32: sums of a few lengths below 5 m.
+    # 1e-5 covers float32 sums of a few lengths below 5 m.
     np.testing.assert_allclose(fast.distance[there], plain.distance[there], atol=1e-5)
     both = np.isfinite(plain.roadmap.to_go) & there[..., None]
     np.testing.assert_allclose(fast.roadmap.to_go[both], plain.roadmap.to_go[both], atol=1e-5)

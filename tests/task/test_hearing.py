@@ -1,4 +1,4 @@
-"""Who hears whom, how it is written down, and what of it the environment makes."""
+"""Tests which robots hear each other, how an observation holds it, and messages in an arena."""
 
 import dataclasses
 import functools
@@ -21,7 +21,7 @@ from swarmjax.task.stage_config import StageConfig
 
 XPS = [np, jnp]
 NOBODY = np.array([[9.0, 9.0, 0.0, 0.1, 0.1]], np.float32)
-# One in the middle that looks north, one 0.3 m north of it, one 0.4 m east, one 0.8 m west.
+# Robot 0 is in the middle and faces north. The others are 0.3 m north, 0.4 m east and 0.8 m west.
 POSE = np.array([[0, 0, np.pi / 2], [0, 0.3, 0], [0.4, 0, 0], [-0.8, 0, 0]], np.float32)
 SAID = np.array([[0.1], [0.2], [0.3], [0.4]], np.float32)
 PRESENT = np.ones(4, bool)
@@ -37,7 +37,7 @@ def _listen(
     seed: int | None = None,
     **realism: Any,
 ) -> np.ndarray:
-    """What each robot hears, [R, K, W], within 0.7 m."""
+    """Returns what each robot hears within 0.7 m, [R, K, W]."""
     config = NeighboursConfig(count=count, message_size=said.shape[-1])
     obstacle, pose = xp.asarray(obstacle, xp.float32), xp.asarray(pose)
     hidden = hearing.hidden(pose, obstacle, xp)
@@ -49,9 +49,9 @@ def _listen(
 
 @pytest.mark.parametrize("xp", XPS)
 def test_neighbours_are_nearest_first_in_the_frame_of_the_one_that_hears(xp: Any) -> None:
-    # The one north is straight ahead; the one east is to the right, at -90 degrees.
+    # The robot in the north is straight ahead; the robot in the east is at -90 degrees.
     expected = [[1.0, 0.3, 1.0, 0.0, 0.2], [1.0, 0.4, 0.0, -1.0, 0.3]]
-    np.testing.assert_allclose(_listen(xp)[0], expected, atol=1e-6)  # float32 of a sine
+    np.testing.assert_allclose(_listen(xp)[0], expected, atol=1e-6)  # a sine in float32
 
 
 @pytest.mark.parametrize("xp", XPS)
@@ -70,7 +70,7 @@ def test_a_wall_in_between_hides_both_from_each_other(xp: Any) -> None:
     wall = np.array([[0.0, 0.15, 0.0, 0.05, 0.01]], np.float32)
     found = _listen(xp, obstacle=wall)
     np.testing.assert_allclose(found[0, :, 1], [0.4, 0.0], atol=1e-7)
-    np.testing.assert_allclose(found[1, :, 1], [0.5, 0.0], atol=1e-7)  # the one east alone
+    np.testing.assert_allclose(found[1, :, 1], [0.5, 0.0], atol=1e-7)  # only the robot in the east
 
 
 @pytest.mark.parametrize("xp", XPS)
@@ -92,7 +92,7 @@ def test_packets_are_lost_as_often_as_said(xp: Any) -> None:
     whom = {"pose": pose, "present": np.ones(40, bool), "said": np.zeros((40, 0), np.float32)}
     found = _listen(xp, count=32, seed=1, packet_loss=0.75, **whom)
     heard = found[..., 0].sum() / (40 * 39)
-    assert abs(heard - 0.25) < 0.044  # 4 deviations of 1,560 packets
+    assert abs(heard - 0.25) < 0.044  # 4 standard errors, from 1,560 packets
 
 
 def test_a_lost_packet_leaves_no_trace() -> None:
@@ -117,7 +117,7 @@ def test_numpy_and_jax_hear_the_same(seed: int, count: int) -> None:
     whom |= {"present": draw.random(5) < 0.8, "said": draw.uniform(-1, 1, (5, 2))}
     whom["said"] = whom["said"].astype(np.float32)
     found = [_listen(xp, seed=seed % 2**31, packet_loss=0.3, **whom) for xp in XPS]
-    np.testing.assert_allclose(found[0], found[1], atol=2e-6)  # float32 of sine and root
+    np.testing.assert_allclose(found[0], found[1], atol=2e-6)  # sine and square root in float32
 
 
 def test_the_layout_names_what_is_heard() -> None:
@@ -168,7 +168,7 @@ def world() -> env.World:
 
 @pytest.fixture(scope="module")
 def level() -> Level:
-    """The first arrives at once; the third is absent."""
+    """Returns a level whose first robot arrives after driving one step; its third is absent."""
     return Level(
         side=np.float32(1.0),
         present=np.array([True, True, False]),
@@ -181,7 +181,7 @@ def level() -> Level:
 
 
 def _play(world: env.World, level: Level, action: np.ndarray, steps: int) -> list[np.ndarray]:
-    """Messages [R, K, M] heard after each step, before the first one at the front."""
+    """Returns the messages [R, K, M] heard at the start and after each step."""
     from swarmjax.sim import physics
 
     state = env.reset(world, jax.tree.map(jnp.asarray, level))
@@ -196,7 +196,7 @@ def _play(world: env.World, level: Level, action: np.ndarray, steps: int) -> lis
 def test_messages_are_heard_in_the_next_control_step(world: env.World, level: Level) -> None:
     action = np.array([[-1, 0, 0.25, -3.0], [-1, 0, 0.5, 0.75], [1, 1, 1, 1]], np.float32)
     first, second = _play(world, level, action, 1)
-    assert not first.any()  # nobody has said anything
+    assert not first.any()  # no robot has sent a message yet
     np.testing.assert_array_equal(second[:2, 0], [[0.5, 0.75], [0.25, -1.0]])
     assert not second[:2, 1].any()  # the third is absent
 

@@ -1,4 +1,4 @@
-"""One arena by `task.arrival=hold`: robots go on, and all must be there at once."""
+"""Tests `task.arrival=hold`: robots keep driving, and all must be at their targets at once."""
 
 import dataclasses
 import functools
@@ -42,7 +42,7 @@ def _stack[Tree](trees: list[Tree]) -> Tree:
 
 @pytest.fixture(scope="module")
 def play(tiny_world: World) -> Play:
-    """Plays the scene by a rule, to a step limit, with actions [64, 3, 2]."""
+    """Returns a function that plays the scene with a rule, step limit and actions [64, 3, 2]."""
 
     @functools.cache
     def compiled(rule: Arrival, limit: int) -> tuple[World, Callable, list[int]]:
@@ -78,8 +78,8 @@ def episode(play: Play) -> Episode:
 def test_a_robot_has_arrived_while_it_is_within_its_target(episode: Episode) -> None:
     np.testing.assert_array_equal(episode.state.arrived[1:, :2], holding.arrived())
     assert not episode.state.arrived[0].any()
-    assert not episode.state.arrived[:, 2].any()  # which takes no part
-    # Where the scene says it is, so that the steps are those worked out; 1e-6 m for float32.
+    assert not episode.state.arrived[:, 2].any()  # robot 2 is absent
+    # Robot 0 is where `holding` says, so the steps worked out there apply. 1e-6 m covers float32.
     for step, away in ((ENTERS, 0.06 - 3 * PACE), (LEAVES, 28 * PACE - 0.06)):
         assert episode.state.distance[step, 0] == pytest.approx(away, abs=1e-6)
 
@@ -87,7 +87,7 @@ def test_a_robot_has_arrived_while_it_is_within_its_target(episode: Episode) -> 
 def test_a_robot_within_its_target_drives_on(episode: Episode) -> None:
     place = episode.state.sim.qpos.reshape(RETURNS + 1, ROBOTS, 3)[:, 0, 0]
     expected = PACE * np.arange(holding.STOPS + 1)
-    # 1e-6 m: float32.
+    # 1e-6 m covers float32.
     np.testing.assert_allclose(place[: holding.STOPS + 1], expected, atol=1e-6)
 
 
@@ -106,11 +106,11 @@ def test_what_robots_do_within_their_targets_is_learned_from(episode: Episode) -
 
 
 def test_the_way_and_the_time_outside_are_paid_and_the_end_once(episode: Episode) -> None:
-    # Robot 0 begins steps 1 to 3 and 29 to 64 outside, robot 1 steps 1 to 40.
+    # Robot 0 begins steps 1 to 3 and 29 to 64 outside its target, and robot 1 steps 1 to 40.
     outside = np.array([ENTERS + RETURNS - LEAVES, OTHER])
     assert outside.tolist() == [39, 40]
     way = episode.state.distance[0, :2] - episode.state.distance[-1, :2]
-    # 1e-5: float32, sums of 64 numbers of up to 8.
+    # 1e-5 covers float32 sums of 64 numbers of up to 8.
     np.testing.assert_allclose(
         episode.came.reward.sum(axis=0)[:2], way - 0.25 * outside + 8.0, atol=1e-5
     )
@@ -149,7 +149,7 @@ def test_every_step_is_of_one_trace(play: Play) -> None:
 
 
 def _step(before: float, now: float, *, was_there: bool) -> reward.Step:
-    """A control step of one robot that meets nothing, and does not end the episode."""
+    """Returns a control step of one robot that touches nothing and does not end the episode."""
     return reward.Step(
         distance_before=jnp.array([before]),
         distance=jnp.array([now]),
@@ -163,14 +163,15 @@ def _step(before: float, now: float, *, was_there: bool) -> reward.Step:
 
 @given(st.lists(st.floats(0.0, 0.25, width=32), min_size=1, max_size=20))
 def test_leaving_and_coming_back_earns_nothing(way: list[float]) -> None:
-    """Whatever way a robot takes from its target and back, as if it had waited or worse."""
+    """Checks that leaving the target and coming back never earns more than waiting there."""
     path, weights = [0.02, *way, 0.02], RewardConfig(proximity=-0.001, arrival=8.0)
     total = sum(
         float(reward.total(_step(before, now, was_there=before <= 0.05), weights)[0])
         for before, now in itertools.pairwise(path)
     )
     outside = sum(distance > 0.05 for distance in path)
-    # 0.002 a step outside and 0.001 for what is in range. 1e-6: float32, 21 differences.
+    # A step outside costs 0.002, and 0.001 for what is in range. 1e-6 covers 21 differences in
+    # float32.
     assert total == pytest.approx(-0.003 * outside, abs=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""Layouts: what each promises of its levels, the same bits by NumPy and JAX, and bad numbers."""
+"""Tests the guarantees of each layout, bit-equal draws in NumPy and JAX, and refused numbers."""
 
 import functools
 from functools import partial
@@ -18,9 +18,9 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig, complete
 from tests.sentences import refusal
 
-HULL, REACH = 0.037, 0.05  # m, of an e-puck and its zone of arrival
+HULL, REACH = 0.037, 0.05  # m; radii of an e-puck and its zone of arrival
 ROUNDING = 1.0 / 1024  # m; corners are rounded to units of 1/4096 m
-# Numbers of each layout beyond those that its stage file trains on.
+# Settings of each layout beyond those on which its stage file trains.
 FAR: dict[str, dict[str, Any]] = {
     "trap": {"depth": 0.4, "width": 0.3},
     "fence": {"length": 0.7},
@@ -57,11 +57,11 @@ def _levels(name: str, count: int = 40, *, far: bool = False) -> list[Level]:
 
 
 def _from_boxes(drawn: Level, places: np.ndarray) -> np.ndarray:
-    """Distance [...] of points [..., 2] from the nearest wall within the arena, m."""
+    """Returns the distance [...] from points [..., 2] to the nearest wall inside the arena, m."""
     boxes = drawn.obstacle[drawn.obstacle_present]
     if not len(boxes):
         return np.full(places.shape[:-1], np.inf)
-    # No wall of a layout is turned.
+    # No layout has a turned wall.
     away = np.abs(places[..., None, :] - boxes[:, :2]) - boxes[:, 3:]
     return np.linalg.norm(np.maximum(away, 0.0), axis=-1).min(axis=-1)
 
@@ -247,7 +247,7 @@ def test_mazes_keep_walls_and_differ() -> None:
 
 
 def _joined(pairs: np.ndarray, count: int) -> int:
-    """How many parts a graph has."""
+    """Returns the number of connected components of a graph."""
     label = np.arange(count)
     for _ in range(count):
         for one, other in pairs:
@@ -272,7 +272,7 @@ def test_robots_on_a_circle_change_places() -> None:
 
 @pytest.mark.parametrize("count", [40, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_robots_on_a_circle_arrive_by_all_driving_around_it(count: int) -> None:
-    """The plan: all go half way round at once, as far apart as they began."""
+    """Rotates all robots half way round at once, which keeps the distances between them."""
     angles = np.linspace(0.0, np.pi, 65)
     turns = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=-1)
     for drawn in _levels("circle", count):
@@ -302,7 +302,7 @@ def test_layouts_are_turned_and_mirrored() -> None:
 
 
 def test_other_stages_of_a_program_are_drawn_as_alone() -> None:
-    # With one that is placed at random, which laid-out stages alone do without.
+    # The third stage is placed at random. Only a stack of laid-out stages has `laid_out`.
     stages = [
         _stage("trap"),
         _stage("fence"),

@@ -1,4 +1,4 @@
-"""Ten thousand levels of the shipped stages, judged by geometry of their own."""
+"""Checks ten thousand levels of the shipped stages with geometry of the tests' own."""
 
 import math
 from collections.abc import Callable
@@ -42,7 +42,10 @@ Draw = Callable[[np.ndarray, task_stage.Stage], Level]
 
 @pytest.fixture(scope="session")
 def draw() -> Draw:
-    """Draws levels [N] from uniform numbers [N, ...] and stages [N], by JAX."""
+    """Returns a function that draws levels [N] with JAX.
+
+    It takes uniform numbers [N, ...] and stages [N].
+    """
     sample = jax.jit(jax.vmap(lambda u, stage: level.sample(u, stage, SPACING, jnp)))
 
     def drawn(uniforms: np.ndarray, stage: task_stage.Stage) -> Level:
@@ -62,7 +65,7 @@ def _repeated(stage: StageConfig, count: int = PER_STAGE) -> task_stage.Stage:
 
 @pytest.fixture(scope="session")
 def levels(draw: Draw) -> dict[str, Level]:
-    """`PER_STAGE` levels of each stage."""
+    """Returns `PER_STAGE` levels of each stage."""
     return {
         stage.name: draw(_uniforms(seed), _repeated(stage)) for seed, stage in enumerate(STAGES)
     }
@@ -79,19 +82,19 @@ def drawn(stage: StageConfig, levels: dict[str, Level]) -> Level:
 
 
 def _between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Distances [N, I, J] between points [N, I, 2] and [N, J, 2]."""
+    """Returns the distances [N, I, J] between points [N, I, 2] and [N, J, 2]."""
     return np.linalg.norm(first[:, :, None] - second[:, None], axis=-1)
 
 
 def _among(points: np.ndarray) -> np.ndarray:
-    """Distances [N, I, I] between points [N, I, 2], inf from a point to itself."""
+    """Returns the distances [N, I, I] between points [N, I, 2], inf from a point to itself."""
     apart = _between(points, points)
     apart[:, np.eye(points.shape[1], dtype=bool)] = np.inf
     return apart
 
 
 def _to_boxes(place: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """Signed distances [N, I, M] from points [N, I, 2] to turned boxes [N, M, 5]."""
+    """Returns signed distances [N, I, M] from points [N, I, 2] to turned boxes [N, M, 5]."""
     offset = place[:, :, None] - box[:, None, :, :2]
     cos, sin = np.cos(box[:, None, :, 2]), np.sin(box[:, None, :, 2])
     along = np.abs(cos * offset[..., 0] + sin * offset[..., 1]) - box[:, None, :, 3]
@@ -101,7 +104,7 @@ def _to_boxes(place: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _corners(box: np.ndarray) -> np.ndarray:
-    """Corners [N, M, 4, 2] of turned boxes [N, M, 5]."""
+    """Returns the corners [N, M, 4, 2] of turned boxes [N, M, 5]."""
     sign = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
     x, y = np.moveaxis(sign * box[..., None, 3:], -1, 0)
     cos, sin = np.cos(box[..., 2:3]), np.sin(box[..., 2:3])
@@ -110,7 +113,9 @@ def _corners(box: np.ndarray) -> np.ndarray:
 
 
 def _box_gaps(box: np.ndarray) -> np.ndarray:
-    """Distances [N, M, M] between turned boxes [N, M, 5] that do not overlap, inf to itself.
+    """Returns distances [N, M, M] between turned boxes [N, M, 5] that do not overlap.
+
+    The distance of a box to itself is inf.
 
     Two rectangles that do not overlap are nearest at a corner of one of them.
     """
@@ -141,18 +146,19 @@ def test_numpy_and_jax_draw_the_same_levels(stage: StageConfig, drawn: Level) ->
     assert expected.start.dtype == expected.target.dtype == expected.obstacle.dtype == np.float32
 
 
-# --- an arena of any size between two
+# --- an arena whose side is drawn from a range
 
 RANGE = StageConfig(name="range", robots=3, side=(0.8, 1.3), obstacles=2)
 
 
 def test_a_side_is_drawn_from_its_range(draw: Draw) -> None:
     side = draw(_uniforms(20), _repeated(RANGE)).side
-    # The whole units within 0.8 m (3276.8) and 1.3 m (5324.8).
+    # The bounds are the whole units between 0.8 m (3276.8) and 1.3 m (5324.8).
     np.testing.assert_array_equal(side * UNITS, np.round(side * UNITS))
     assert (side * UNITS >= 3277).all()
     assert (side * UNITS <= 5324).all()
-    # A fair sampler fails a seed with probability 1e-5; drawn before any look at the result.
+    # A fair sampler fails at a given seed with probability 1e-5. The seed was chosen before the
+    # result was known.
     assert stats.kstest((side * UNITS - 3277 + 0.5) / 2048, "uniform").pvalue > 1e-5
 
 
@@ -175,7 +181,7 @@ def test_numpy_draws_the_same_side(draw: Draw) -> None:
 
 
 def test_nothing_else_depends_on_the_range(draw: Draw) -> None:
-    """The level is the one that a stage of just the drawn side has."""
+    """Compares each level with the level of a stage whose only side is the drawn one."""
     found, stage = draw(_uniforms(23), _repeated(RANGE)), _repeated(RANGE)
     assert len(np.unique(found.side)) > 1000
     same = draw(_uniforms(23), stage._replace(side=found.side, largest_side=found.side))
@@ -191,7 +197,7 @@ def test_nothing_overlaps_in_an_arena_of_any_size(draw: Draw) -> None:
     _assert_nothing_overlaps(found, RANGE.robots, RANGE.obstacles)
 
 
-# --- what is there, and where it is
+# --- what a level contains, and where
 
 
 def test_the_stage_says_how_many_there_are(stage: StageConfig, drawn: Level) -> None:
@@ -213,12 +219,12 @@ def test_what_is_absent_waits_outside_at_a_place_of_its_own(
     assert (np.abs(boxes[..., :2]).max(axis=-1) - reach > 2.1).all()
     assert (_among(robots[..., :2]) > WIDTH).all()
     assert (_to_boxes(robots[..., :2].astype(float), drawn.obstacle) > HULL).all()
-    # None of them looks like a robot on its way to somewhere.
+    # Absent robots stand on their targets, so none looks as if it were on its way.
     np.testing.assert_array_equal(drawn.target[:, stage.robots :], robots[..., :2])
 
 
 def _assert_nothing_overlaps(drawn: Level, robots: int, obstacles: int) -> None:
-    """Robots on their starts and on their targets, obstacles and walls."""
+    """Asserts that robots at starts or targets overlap no robot, obstacle or wall."""
     start, target = drawn.start[:, :robots, :2], drawn.target[:, :robots]
     half = 0.5 * drawn.side[:, None]
     box = drawn.obstacle[:, :obstacles].astype(np.float64)
@@ -226,8 +232,7 @@ def _assert_nothing_overlaps(drawn: Level, robots: int, obstacles: int) -> None:
         assert (_among(place) > WIDTH).all()
         assert (np.abs(place).max(axis=-1) < half - HULL).all()
         assert (_to_boxes(place, box) > HULL).all()
-    # No robot starts where it has arrived, nor where another that has arrived would touch it
-    # at its target.
+    # No robot starts in the zone of arrival of any target, its own or another robot's.
     assert (_between(start, target) > REACH).all()
 
 
@@ -252,19 +257,19 @@ def test_targets_are_so_far_apart_that_a_robot_passes_between_two_parked_ones(
 
 
 def test_levels_fill_the_arena(stage: StageConfig, drawn: Level) -> None:
-    # One place a level, so that the counts are independent; mirror images are as likely.
+    # One place per level makes the counts independent. Mirror images are equally likely.
     for place in (drawn.start[:, 0, :2], drawn.target[:, 0]):
         quadrant = 2 * (place[:, 0] > 0) + (place[:, 1] > 0)
         counts = np.bincount(quadrant, minlength=4)
-        # A fair sampler fails a seed with probability 1e-5.
+        # A fair sampler fails at a given seed with probability 1e-5.
         assert stats.chisquare(counts).pvalue > 1e-5, counts
-        # Rounded up from the hull and 2 cm, a robot's centre comes as near to any wall; what is
-        # left over is less than one step of the lattice.
+        # A robot's centre comes as near to any wall as the hull and 2 cm, rounded up. The rim that
+        # is left over is less than one step of the lattice.
         rim = 0.5 * stage.sides[0] - HULL - MARGIN - np.array([place.max(), -place.min()])
         assert (rim < stage.sides[0] / LATTICE + 1 / UNITS).all()
-        # No ninth of it is left out. The middle one has the least, where the obstacle of a small
-        # arena must stand: a fifth of its share was seen (34 of 159), 3 standard deviations of the
-        # count above the bound; the seeds are fixed.
+        # Every ninth of the arena is used. The middle ninth has the fewest robots, because the
+        # obstacle of a small arena must stand there: a fifth of an equal share was seen (34 of
+        # 159), 3 standard deviations of the count above the bound. The seeds are fixed.
         third = np.clip(np.floor(3 * (place / (stage.sides[0] - 2 * HULL - 0.04) + 0.5)), 0, 2)
         cells = np.bincount((3 * third[:, 0] + third[:, 1]).astype(int), minlength=9)
         assert (cells > 0.1 * PER_STAGE / 9).all(), cells
@@ -276,11 +281,11 @@ def test_headings_point_everywhere(stage: StageConfig, drawn: Level) -> None:
     turn = drawn.obstacle[:, : stage.obstacles, 2].reshape(-1)
     assert ((turn >= 0.0) & (turn <= 0.5 * math.pi)).all()
     counts = np.histogram(yaw, bins=8, range=(-math.pi, math.pi))[0]
-    # A fair sampler fails a seed with probability 1e-5.
+    # A fair sampler fails at a given seed with probability 1e-5.
     assert stats.chisquare(counts).pvalue > 1e-5, counts
     if turn.size:
         counts = np.histogram(turn, bins=4, range=(0.0, 0.5 * math.pi))[0]
-        assert stats.chisquare(counts).pvalue > 1e-5, counts  # likewise
+        assert stats.chisquare(counts).pvalue > 1e-5, counts  # as above
 
 
 # --- every target stays reachable in any order of arrival
@@ -290,10 +295,11 @@ FINE_CELL = 0.0025  # m, of the second
 
 
 class _Flood:
-    """The centres of a robot among the walls and obstacles of levels [N], on a grid.
+    """A grid of places for a robot's centre among the walls and obstacles of levels [N].
 
-    A cell is free where its centre keeps half a cell more than the robot's radius. The way
-    between the centres of two free neighbours is then free itself: a path found is a path.
+    A cell is free if its centre keeps the robot's radius and half a cell from walls and obstacles.
+    The straight line between the centres of two free neighbours is then free too, so a path over
+    free cells is a path for the robot.
     """
 
     def __init__(self, drawn: Level, obstacles: int, cell: float) -> None:
@@ -308,14 +314,14 @@ class _Flood:
             self.free &= far.reshape(self.free.shape)
 
     def squared(self, centre: np.ndarray) -> np.ndarray:
-        """Squared distances [N, X, Y] of all cells to points [N, 2]."""
+        """Returns the squared distances [N, X, Y] from all cells to points [N, 2]."""
         offset = self.grid[None] - centre[:, None, None]
         return offset[..., 0] ** 2 + offset[..., 1] ** 2
 
     def reaches(self, start: np.ndarray, goal: np.ndarray, blocked: np.ndarray) -> np.ndarray:
-        """Whether [N] a way leads from start [N, 2] to a cell of goal [N, X, Y]."""
+        """Returns whether a path leads from start [N, 2] to a cell of goal [N, X, Y], [N] bool."""
         plane = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]])
-        structure = np.stack([0 * plane, plane, 0 * plane])  # each level by itself
+        structure = np.stack([0 * plane, plane, 0 * plane])  # connects no two levels
         label = np.zeros(self.free.shape, np.int32)
         ndimage.label(self.free & ~blocked, structure=structure, output=label)
         x, y = np.floor((start + 0.5 * self.side) / self.cell).astype(int).T
@@ -324,7 +330,7 @@ class _Flood:
 
 
 def _cut_off(drawn: Level, stage: StageConfig) -> list[tuple[int, int]]:
-    """Levels and robots that find no way while every other target is a wide closed disc.
+    """Returns levels and robots that have no path while a wide disc closes each other target.
 
     The disc holds all places that a robot parked within `REACH` of its target closes to another.
     """
@@ -343,7 +349,7 @@ def _cut_off(drawn: Level, stage: StageConfig) -> list[tuple[int, int]]:
 
 
 def _is_cut_off_by_one(drawn: Level, stage: StageConfig, index: int, robot: int) -> bool:
-    """Whether a single other target, as a closed disc, cuts a robot of one level off."""
+    """Returns whether the closed disc of a single other target cuts off a robot of one level."""
     one = Level(*(field[index : index + 1] for field in drawn))
     flood = _Flood(one, stage.obstacles, FINE_CELL)
     goal = flood.squared(one.target[:, robot]) <= REACH**2
@@ -358,14 +364,14 @@ def _is_cut_off_by_one(drawn: Level, stage: StageConfig, index: int, robot: int)
 def test_every_target_stays_reachable_in_any_order_of_arrival(
     stage: StageConfig, drawn: Level
 ) -> None:
-    # First with all others parked at once, and everywhere at once where they may park. That is
-    # more than they can close: discs of two targets overlap the moment half a cell is added,
-    # yet two robots, each at one place, leave a way between them (asserted above, and for a
-    # robot and an obstacle). Closed sets that meet in the walls alone cut nothing off together
-    # that none of them cuts off with the walls (Janiszewski's theorem), so that what the first
-    # flood does not reach is settled by one disc at a time.
+    # The first flood closes, all at once, every place that any of the other robots could close by
+    # parking. This is more than parked robots can close: the discs of two targets overlap as soon
+    # as half a cell is added, yet two robots, each at one place, leave a way between them. (Tests
+    # above assert this, also for a robot and an obstacle.) By Janiszewski's theorem, closed sets
+    # that meet only in the walls cut nothing off together unless one of them cuts it off with the
+    # walls. For robots that the first flood does not reach, one disc at a time is therefore enough.
     suspects = _cut_off(drawn, stage)
-    assert len(suspects) < 0.01 * PER_STAGE  # else the first flood proves little
+    assert len(suspects) < 0.01 * PER_STAGE  # otherwise the first flood proves little
     assert not [s for s in suspects if _is_cut_off_by_one(drawn, stage, *s)]
 
 
@@ -399,7 +405,7 @@ def test_nothing_overlaps_on_any_stage_that_is_accepted(
         return
     found = draw(_uniforms(seed, 64), _repeated(stage, 64))
     assert (found.present.sum(axis=-1) == robots).all()
-    assert (found.obstacle_present.sum(axis=-1) <= obstacles).all()  # one without room is left out
+    assert (found.obstacle_present.sum(axis=-1) <= obstacles).all()  # some obstacles may not fit
     _assert_nothing_overlaps(found, robots, obstacles)
     for i in range(64):
         box = found.obstacle[i : i + 1, found.obstacle_present[i]].astype(np.float64)
@@ -418,5 +424,5 @@ def test_gaps_agree_with_this_geometry(levels: dict[str, Level]) -> None:
             _to_boxes(place, drawn.obstacle[i : i + 1])[0].min(axis=-1) - HULL,
             0.5 * drawn.side[i] - np.abs(place[0]).max(axis=-1) - HULL,
         ]
-        # 1e-5 m: float32 at 5 m, where absent things are parked.
+        # 1e-5 m covers float32 at 5 m, where absent things are parked.
         np.testing.assert_allclose(found, np.stack(expected, axis=-1), atol=1e-5)

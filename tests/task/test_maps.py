@@ -1,4 +1,4 @@
-"""Arenas drawn as text: what a map says, what is refused, and the levels that are drawn on it."""
+"""Tests arenas given as text: what a map means, which maps are refused, and drawn levels."""
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +53,8 @@ def _uniforms(count: int) -> np.ndarray:
 
 
 def test_a_map_by_hand() -> None:
-    # Four columns and two rows of 0.2 m: 0.8 m wide, with 0.2 m of wall above and below.
+    # Four columns and two rows of 0.2 m make an arena 0.8 m wide, with 0.2 m of wall above and
+    # below.
     found = maps.read(["#S.#", "#.T#"], 0.2)
     assert found.side == 0.8
     walls = sorted(found.wall.round(6).tolist())
@@ -63,7 +64,7 @@ def test_a_map_by_hand() -> None:
         [0.0, 0.3, 0.0, 0.4, 0.1],
         [0.3, 0.0, 0.0, 0.1, 0.2],
     ]
-    # S is the second column of the upper row: x from -0.2 to 0, y from 0 to 0.2.
+    # S is in the second column of the upper row: x from -0.2 to 0, y from 0 to 0.2.
     np.testing.assert_allclose(found.start.mean(axis=0), [-0.1, 0.1], atol=1e-12)
     np.testing.assert_allclose(found.target.mean(axis=0), [0.1, -0.1], atol=1e-12)
     assert len(found.start) == 36  # points 0.033 m apart
@@ -86,13 +87,13 @@ def test_rectangles_cover_the_wall_once(cells: list[list[bool]]) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("### #S", "map has 3 letters in row 1 and 2 in row 2: give rows of the same length."),
+        ("### #S", "map has 3 characters in row 1 and 2 in row 2: give rows of the same length."),
         ("#S?T#", "map has '?' in row 1, column 3: give # (wall), . (floor), S (start area), "),
         ("#s.T#", "map has 's' in row 1, column 2: give S or T for an area, or another letter"),
         ("#S#T#", "map has a target in row 1, column 4 that cannot be reached from the start in "),
         ("#S..#", "map has 1 cells of S and 0 of T: give both, or a letter for each robot."),
         ("#a..#", "map has 'A' 0 times: give the start (a) and the target (A) of a robot once"),
-        ("#" * 49, "map has 1 rows of 49 letters: give at most 48 of each, and larger cells."),
+        ("#" * 49, "map has 1 rows of 49 characters: give at most 48 of each, and larger cells."),
     ],
 )
 def test_refuses_a_text(text: str, said: str) -> None:
@@ -111,7 +112,7 @@ def test_refuses_too_many_walls() -> None:
     ("text", "robots", "said"),
     [
         (LETTERS, 1, "robots is 1, but map has letters for 2: give at least 2."),
-        (LETTERS, 3, "robots is 3, but map has letters for 2 and no S and T: give 2, or areas S "),
+        (LETTERS, 3, "robots is 3, but map has letters for 2 and no areas S and T: give 2, or "),
         ("aAST", 0, "robots is 0: give 1 to 100"),
     ],
 )
@@ -169,7 +170,7 @@ def test_numpy_and_jax_draw_the_same() -> None:
 
 
 def _cells(text: str, letter: str, cell: float = 0.12) -> np.ndarray:
-    """Centres of the cells of a letter, worked out from the text alone."""
+    """Returns the centres of the cells of a letter, worked out from the text alone."""
     rows = text.split()
     return np.array(
         [
@@ -206,7 +207,8 @@ def test_every_open_point_is_used() -> None:
     arrays = task_stage.single(_stage("S..T", 1, cell=0.2)).map
     assert arrays is not None
     drawn = {tuple(each.start[0, :2]) for each in _draw(_stage("S..T", 1, cell=0.2), 2000)}
-    # 6 x 6 points 0.033 m apart; the two next to the walls on three sides leave 4 x 2 of room.
+    # The cell has 6 x 6 points, 0.033 m apart. Along each of three walls, two rows of points are
+    # too close to the wall, which leaves 4 x 2 points.
     assert len(drawn) == 8
 
 

@@ -1,4 +1,4 @@
-"""Mutated levels: drawn by the rules of placement from numbers of which one has moved."""
+"""Tests mutated levels, which are drawn as usual after one of their numbers has changed."""
 
 import functools
 from dataclasses import replace
@@ -17,7 +17,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig, complete
 
-HULL, REACH = 0.037, 0.05  # m, of an e-puck and its zone of arrival
+HULL, REACH = 0.037, 0.05  # m; radii of an e-puck and its zone of arrival
 STAGES = [
     "world_trap",
     "world_fence",
@@ -31,8 +31,8 @@ STAGES = [
     "world_dense",
     "s6",
 ]
-# Mutated levels are drawn in NumPy, a few milliseconds each: of each stage 30 here, and 240 in the
-# slow tests, 2,640 in all.
+# NumPy takes a few milliseconds to draw a mutated level. The fast tests draw 30 levels of each
+# stage, and the slow tests 240, which is 2,640 in all.
 PARENTS, GENERATIONS = 30, [1, pytest.param(8, marks=pytest.mark.slow)]
 MUTATE = jax.jit(jax.vmap(levels.mutate, in_axes=(0, None, 0)))
 
@@ -42,12 +42,12 @@ def _stage(name: str) -> StageConfig:
 
 
 def _spacing(stage: StageConfig) -> Spacing:
-    # Two more of each are compiled in than take part.
+    # Two more robots and obstacles are compiled in than take part.
     return Spacing(stage.robots + 2, stage.obstacles + 2, HULL, REACH)
 
 
 def _numbers(stage: StageConfig, count: int) -> np.ndarray:
-    """Numbers of drawn levels, written out."""
+    """Returns the numbers of drawn levels, written out."""
     spacing = _spacing(stage)
     size = (count, level.uniform_count(spacing))
     uniforms = np.random.default_rng(7).random(size, dtype=np.float32)
@@ -57,7 +57,7 @@ def _numbers(stage: StageConfig, count: int) -> np.ndarray:
 
 @functools.cache
 def _family(name: str, generations: int) -> list[tuple[Level, Level]]:
-    """Levels, each with the one that it was mutated from."""
+    """Returns mutated levels, each with the level from which it was mutated."""
     stage = _stage(name)
     arrays, spacing = task_stage.single(stage), _spacing(stage)
     numbers, movable = _numbers(stage, PARENTS), mutation.movable([stage], spacing)[0]
@@ -84,7 +84,7 @@ def test_nothing_of_a_mutated_level_overlaps(name: str, generations: int) -> Non
         start, target = drawn.start[drawn.present], drawn.target[drawn.present]
         assert len(start) == _stage(name).robots
         assert min(_least(start[:, :2]), _least(target)) >= 2.0 * HULL
-        # From starts, and from robots that stand on their targets, to walls and boxes.
+        # Robots keep a gap to walls and boxes, both at their starts and on their targets.
         for pose in (start, np.concatenate([target, 0.0 * target[:, :1]], axis=-1)):
             gap = gaps.gaps(pose, drawn.side, drawn.obstacle, HULL, np)
             assert gap.min() > 0.0
@@ -98,8 +98,8 @@ def test_a_mutation_changes_the_level_and_keeps_its_seed(name: str) -> None:
         fields = zip(drawn, parent, strict=True)
         same += all(np.array_equal(one, other) for one, other in fields)
         assert drawn.seed == parent.seed
-    # A number may move within what rounds to the same place. In a maze two of three change nothing:
-    # the number of a room that is empty, or of a wall that is there either way.
+    # A changed number may round to the same place. In a maze, two of three changes have no effect:
+    # they concern the number of an empty room, or of a wall that is present either way.
     assert same / len(family) < (0.9 if name == "world_maze" else 0.25)
 
 
@@ -155,7 +155,7 @@ def test_robots_of_a_map_that_have_letters_stay_where_they_are() -> None:
     spacing = Spacing(3, stage.obstacles, HULL, REACH)
     found = mutation.movable([stage], spacing)[0]
     first = 6 + 2 * stage.obstacles
-    # Targets of the second and third robot, then their starts.
+    # The movable numbers are the targets of the second and third robot, then their starts.
     np.testing.assert_array_equal(np.flatnonzero(found), first + np.array([1, 2, 4, 5]))
 
 

@@ -1,4 +1,4 @@
-"""What a robot observes, by hand."""
+"""Tests what a robot observes against values worked out by hand."""
 
 import json
 from types import ModuleType
@@ -50,7 +50,7 @@ def test_a_stack_has_the_newest_first_and_zeros_for_what_was_not_seen(xp: Module
         [23, 24, 13, 14, 3, 4],
         [33, 34, 23, 24, 13, 14],
     ]
-    assert observation.stack(looks[0], looks[1], xp) is looks[0]  # of one there is nothing to do
+    assert observation.stack(looks[0], looks[1], xp) is looks[0]  # a stack of one is its input
 
 
 def test_entries_of_a_stack_say_how_old_they_are() -> None:
@@ -81,7 +81,7 @@ def test_target(
 ) -> None:
     place = xp.asarray(pose, dtype=xp.float32)
     found = observation.to_target(place, xp.asarray(target, dtype=xp.float32), xp)
-    # 1e-6 m; 1e-5 rad: float32, at a yaw of 30 rad.
+    # 1e-6 m and 1e-5 rad cover float32 at a yaw of 30 rad.
     assert float(found[0]) == pytest.approx(distance, abs=1e-6)
     assert float(found[1]) == pytest.approx(bearing, abs=1e-5)
 
@@ -93,7 +93,8 @@ def test_bearing_lies_within_half_a_turn(yaw: float, angle: float, distance: flo
     found, bearing = observation.to_target(pose, target, np)
     assert found == pytest.approx(distance, abs=1e-12)  # rounding of float64
     assert abs(bearing) <= PI
-    # As directions: half a turn to the left is half a turn to the right. Rounding of float64.
+    # Bearings are compared as directions, because half a turn to the left is half a turn to the
+    # right. 1e-11 covers the rounding of float64.
     assert abs(np.exp(1j * bearing) - np.exp(1j * angle)) < 1e-11
 
 
@@ -112,7 +113,7 @@ def test_order(xp: ModuleType) -> None:
 
 @MODULES
 def test_scale_of_the_published_example(xp: ModuleType) -> None:
-    # Counts / 1023, distance / 1.5 m, and a bearing that is 0.5 dead ahead and 1 at +pi.
+    # Entries are counts / 1023, distance / 1.5 m, and a bearing, 0.5 dead ahead and 1 at +pi.
     found = observation.observe(
         Readings(xp.asarray([[1023.0] * 7 + [67.19]]), xp.asarray([0.75]), xp.asarray([0.5 * PI])),
         observation.LAYOUTS["webots"],
@@ -123,4 +124,4 @@ def test_scale_of_the_published_example(xp: ModuleType) -> None:
     ahead = observation.observe(
         Readings(xp.zeros(8), xp.zeros(()), xp.zeros(())), observation.LAYOUTS["webots"], xp
     )
-    np.testing.assert_allclose(ahead, [0.0] * 9 + [0.5], atol=1e-7)  # likewise
+    np.testing.assert_allclose(ahead, [0.0] * 9 + [0.5], atol=1e-7)  # float32

@@ -1,4 +1,4 @@
-"""The presets of robot and realism, number by number, and what they refuse."""
+"""Tests every number of the presets of robot and realism, and which settings are refused."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ WEBOTS = IDEAL | {
 REAL = {
     "name": "real",
     "infrared": "real",
-    "infrared_noise": (0.5, 2.0),  # as Webots' s is varied
+    "infrared_noise": (0.5, 2.0),  # factor on the model's noise
     "infrared_gain": (0.7, 1.3),
     "infrared_offset": 3.0,
     "infrared_yaw": 0.0349,  # 2 degrees: 2 * 3.1416 / 180 = 0.03491
@@ -46,7 +46,7 @@ REAL = {
     "max_wheel_speed": (6.0, 6.9),
     "mass": (0.13, 0.20),
     "friction": (0.6, 1.2),
-    "hull_friction": None,  # no source says how it differs
+    "hull_friction": None,  # no source tells how it varies
     "speed_noise": 0.05,
     "speed_quantisation": "epuck2",
     "action_latency": (0, 2),
@@ -246,7 +246,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["robot.hull_radius=0.029", "robot.wheel_radius=0.02",
           "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
          "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
-        # 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6 are the wheels'.
+        # The wheels have 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6.
         (["robot=wheeled", "robot.yaw_inertia=7e-6"], "robot.yaw_inertia is 7e-06, but body is "
          "wheeled and its wheels alone have 7.78e-06: give more than 7.78e-06."),
         (["robot.motor_lag=-0.1"], "robot.motor_lag is -0.1: give 0 to 1."),
@@ -265,7 +265,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "10."),
         (["realism=real", "realism.reflectance_wall=[0,1]"], "realism.reflectance_wall is [0,1]: "
          "give more than 0, at most 1."),
-        # Longer than the episode: 500 control steps of 0.032 s are 16 s.
+        # Times longer than the episode, whose 500 control steps of 0.032 s are 16 s.
         (["realism.action_latency=[0,500]"], "realism.action_latency is [0,500], but an episode "
          "takes 500 control steps: give less than 500."),
         (["realism.observation_latency=[0,600]"], "realism.observation_latency is [0,600], but "
@@ -327,7 +327,8 @@ def test_no_factor_is_negative(factor):
 
 
 def test_what_is_off_is_not_held_to_the_episode():
-    # The default stall_time of up to 0.3 s is not drawn, and 3 control steps take 0.096 s.
+    # Without `stall`, the default stall_time of up to 0.3 s is not drawn, so it may be longer than
+    # the 0.096 s of 3 control steps.
     assert load_train(["task.step_limit=3"]).realism.stall is None
     sentence = refusal(load_train, ["task.step_limit=3", "realism.stall=0.1"])
     assert sentence.startswith("realism.stall_time is [0.1,0.3], but an episode takes 0.096 s")

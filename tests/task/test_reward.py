@@ -1,4 +1,4 @@
-"""Each term of the reward by hand, and equation 3 of the paper."""
+"""Tests each term of the reward by hand, and equation 3 of the paper."""
 
 import dataclasses
 import itertools
@@ -17,7 +17,11 @@ EQUATION_3 = RewardConfig(proximity=-0.001, contact=0.0, step_penalty=0.0)
 
 @pytest.fixture
 def step() -> reward.Step:
-    """Four robots: free; one ray short; three rays short, arriving, in contact; backing off."""
+    """Returns a step of four robots.
+
+    The first is free. The second has a short ray and a contact. The third has three short rays and
+    two contacts, and arrives. The fourth backs off and touches a wall.
+    """
     infrared = np.full((4, 8), RANGE, np.float32)
     infrared[1, 2] = 0.039
     infrared[2, :3] = 0.0, 0.01, 0.02
@@ -39,11 +43,11 @@ def step() -> reward.Step:
     [
         ("progress", [0.125, 0.0, 0.03125, -0.25]),  # before - now, exact in binary
         ("path_progress", [0.25, -0.125, 0.03125, 0.0]),
-        ("proximity", [0, 1, 1, 0]),  # once, however many rays; a full ray sees nothing
+        ("proximity", [0, 1, 1, 0]),  # counted once for all rays; a full ray sees nothing
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),
         ("robot_contact", [0, 1, 1, 0]),  # robots are the first of the three kinds
-        ("touching", [0, 1, 1, 1]),  # once, whatever the kinds; no contact need begin
+        ("touching", [0, 1, 1, 1]),  # counted once for all kinds, even if no contact begins
         ("step_penalty", [1, 1, 1, 1]),
     ],
 )
@@ -61,14 +65,14 @@ def test_every_weight_has_its_term() -> None:
 
 def test_without_its_prices_the_default_is_equation_3(step: reward.Step) -> None:
     expected = np.float32([0.125, -0.001, 0.03125 - 0.001, -0.25])
-    # 1e-8: one float32 rounding of the sum.
+    # 1e-8 covers one float32 rounding of the sum.
     np.testing.assert_allclose(reward.total(step, EQUATION_3), expected, atol=1e-8)
 
 
 def test_default_adds_prices_of_contacts_and_time(step: reward.Step) -> None:
-    # 0.2 m a contact that begins, 0.002 m a control step; nothing for a short ray.
+    # A contact that begins costs 0.2 m, a control step 0.002 m, and a short ray nothing.
     expected = np.float32([0.123, -0.202, 0.03125 - 0.402, -0.252])
-    # 1e-8: float32, a few roundings of numbers below 0.3.
+    # 2e-8 covers a few float32 roundings of numbers below 0.3.
     np.testing.assert_allclose(reward.total(step, RewardConfig()), expected, atol=2e-8)
 
 
@@ -91,5 +95,5 @@ def test_progress_telescopes() -> None:
     total = np.zeros(3)
     for before, now in itertools.pairwise(distance):
         total += reward.progress(reward.Step(jnp.asarray(before), jnp.asarray(now), *rest))
-    # 1e-6 m: float32, twenty differences.
+    # 1e-6 m covers twenty float32 differences.
     np.testing.assert_allclose(total, distance[0] - distance[-1], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Shapes of obstacles, by geometry of their own."""
+"""Tests the shapes of obstacles with geometry of the tests' own."""
 
 import math
 
@@ -12,9 +12,9 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
-HALF = 0.05  # m, of the trained box
+HALF = 0.05  # m, half the edge of the boxes in training
 OUTER = HALF * math.sqrt(2)
-THIN = 0.005  # m, half a plate
+THIN = 0.005  # m, half the thickness of a plate
 KINDS: tuple[Shape, ...] = ("bar", "cross", "ell", "pillar")
 
 
@@ -24,7 +24,7 @@ def _drawn() -> Level:
 
 
 def _covers(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether any of boxes [P, 5] covers points [N, 2]."""
+    """Returns whether any of the boxes [P, 5] covers each of the points [N, 2]."""
     offset = points[:, None] - boxes[:, :2]
     cos, sin = np.cos(boxes[:, 2]), np.sin(boxes[:, 2])
     along = np.abs(cos * offset[..., 0] + sin * offset[..., 1])
@@ -33,7 +33,7 @@ def _covers(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _inside(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether points in the obstacle's own frame lie in the shape."""
+    """Returns whether points in the obstacle's own frame lie in the shape."""
     length = math.sqrt(OUTER**2 - THIN**2)
     if shape == "bar":
         return (np.abs(x) <= length) & (np.abs(y) <= THIN)
@@ -42,7 +42,8 @@ def _inside(shape: Shape, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     if shape == "ell":  # the lower and the left edge of the box
         box = (np.abs(x) <= HALF) & (np.abs(y) <= HALF)
         return box & ((y <= -HALF + 2 * THIN) | (x <= -HALF + 2 * THIN))
-    # A regular octagon, its corners 22.5 degrees off the axes: all of eight half planes.
+    # A pillar is a regular octagon with corners 22.5 degrees off the axes. A point inside lies in
+    # all of eight half planes.
     angle = np.arange(8) * math.pi / 4
     reach = x[..., None] * np.cos(angle) + y[..., None] * np.sin(angle)
     return (reach <= OUTER * math.cos(math.pi / 8)).all(axis=-1)
@@ -63,7 +64,8 @@ def test_boxes_make_the_shape(shape: Shape) -> None:
                            y + sin * local[:, 0] + cos * local[:, 1]], axis=-1)  # fmt: skip
         mine = level.obstacle[i * parts : (i + 1) * parts].astype(float)
         found, expected = _covers(mine, points), _inside(shape, local[:, 0], local[:, 1])
-        # Rounded to 1e-6 m: of 20,000 points in 0.0256 m2, one lies so near to 1 m of outline.
+        # Boxes are rounded to 1e-6 m. Of 20,000 points in 0.0256 m2, about one lies that near to
+        # 1 m of outline.
         assert (found != expected).sum() <= 3
         assert 0.02 < found.mean() < 0.8
 

@@ -1,4 +1,4 @@
-"""Stages as arrays."""
+"""Tests stages as arrays."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def test_select_one_or_many() -> None:
     [
         ([PLAIN], 0.05),
         ([PLAIN, BOXES], 0.1),
-        ([PLAIN, BOXES, FENCE], 0.5),  # half of 0.50 m a 0.7 m of side, at 1.4 m
+        ([PLAIN, BOXES, FENCE], 0.5),  # half of a fence of 0.50 m per 0.7 m of side (1.4 m)
         ([SMALL], 0.05),  # the boxes of a fixed level are 0.1 m, whatever `obstacle_size`
     ],
 )
@@ -58,7 +58,7 @@ def test_largest_half(stages: list[StageConfig], expected: float) -> None:
 @pytest.mark.parametrize(
     ("robots", "obstacles", "key", "most"),
     [
-        # Starts at -0.26 * 10 / 7 + 0.1 n, up to 0.06 m from the wall at 0.5 m: n up to 8.
+        # Starts lie at -0.26 * 10 / 7 + 0.1 n and keep 0.06 m from the wall at 0.5 m: n up to 8.
         (10, 0, "robots", 9),
         (2, 5, "obstacles", 4),
     ],

@@ -1,4 +1,4 @@
-"""What a critic sees of the state: places worked out by hand, and in NumPy."""
+"""Tests what a critic sees of the state, against places worked out by hand and in NumPy."""
 
 import jax
 import numpy as np
@@ -40,7 +40,7 @@ def _rectangles(row: np.ndarray) -> np.ndarray:
 
 def test_a_target_is_seen_in_the_robots_frame() -> None:
     level = _level(1, np.zeros((0, 5)))._replace(target=np.float32([[0.3, 0.2]]))
-    # At (0.1, 0.1), facing north: the target lies 0.1 m ahead and 0.2 m to the right.
+    # The robot is at (0.1, 0.1) and faces north: its target is 0.1 m ahead and 0.2 m to the right.
     row = _look(np.array([[0.1, 0.1, np.pi / 2]]), level, np.array([True]))[0]
     np.testing.assert_allclose(row[:3], [0.1, -0.2, 1.0], atol=ROUND)
 
@@ -49,7 +49,7 @@ def test_another_robot_is_seen_with_its_heading_and_its_target() -> None:
     level = _level(2, np.zeros((0, 5)))._replace(target=np.float32([[0, 0], [0.4, 0.4]]))
     pose = np.array([[0.1, 0.1, np.pi / 2], [0.1, 0.3, np.pi]])
     row = _robots(_look(pose, level, np.array([False, True]))[0])[0]
-    # It is 0.2 m ahead and faces to the left; its target is 0.3 m ahead and 0.3 m to the right.
+    # The other robot is 0.2 m ahead and faces left. Its target is 0.3 m ahead and 0.3 m right.
     np.testing.assert_allclose(row, [1.0, 0.2, 0.0, 0.0, 1.0, 0.3, -0.3, 1.0], atol=ROUND)
 
 
@@ -71,10 +71,12 @@ def test_an_absent_robot_is_all_zero() -> None:
 
 
 def test_a_wall_is_seen_by_its_nearest_point_and_its_ends() -> None:
-    # 0.4 m long and 0.02 m thick, across the way, 0.2 m ahead of a robot that faces south.
+    # The wall is 0.4 m long and 0.02 m thick. It lies across the way, 0.2 m ahead of a robot that
+    # faces south.
     level = _level(1, np.array([[0.0, -0.2, 0.0, 0.2, 0.01]]))
     row = _rectangles(_look(np.array([[0.05, 0.0, -np.pi / 2]]), level)[0])[0]
-    # East is to its left: that end is 0.15 m away across, the other 0.25 m.
+    # East is to the robot's left. The east end is 0.15 m to the left, the west end 0.25 m to the
+    # right.
     expected = [1.0, 0.19, 0.0, 0.2, -0.25, 0.2, 0.15, 0.01]
     np.testing.assert_allclose(row, expected, atol=ROUND)
 
@@ -93,12 +95,12 @@ def test_rectangles_are_those_of_numpy(seed: int) -> None:
     for x, y, yaw, half_x, half_y in np.asarray(
         model.fixture_rectangles(np.float32(1.0), boxes, np)
     ):
-        half = np.minimum([half_x, half_y], 1.5)  # of the walls around, what lies in the arena
+        half = np.minimum([half_x, half_y], 1.5)  # cuts outer walls to the arena
         cos, sin = np.cos(yaw), np.sin(yaw)
         points = grid * half @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
         gaps.append(np.hypot(*(points - pose[0, :2]).T).min())
     gaps = np.sort(gaps)[: len(found)]
-    # A grid of points in each rectangle, up to 3 m / 800 apart along a wall.
+    # The grid in each rectangle has points up to 3 m / 800 apart along a wall.
     np.testing.assert_allclose(np.hypot(found[:, 1], found[:, 2]), gaps, atol=4e-3)
     right, left = found[:, 3:5], found[:, 5:7]
     assert (right[:, 0] * left[:, 1] - right[:, 1] * left[:, 0] >= -ROUND).all()
@@ -116,7 +118,7 @@ def test_turning_and_shifting_the_world_changes_nothing_but_the_walls_around() -
         places = x[:, :2] @ matrix.T + shift
         return np.concatenate([places, x[:, 2:3] + turn, x[:, 3:]], axis=1)
 
-    far = 3.9  # the walls around are the last four of seven
+    far = 3.9  # the outer walls are the last four of seven
     here = _level(2, boxes, far)._replace(target=target.astype(np.float32))
     there = _level(2, moved(boxes), far)._replace(
         target=(target @ matrix.T + shift).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A critic that sees the state: what it is shown, what it learns, and what never sees it."""
+"""Checks a critic that sees the state: its input, what it learns, and that actors never see it."""
 
 from dataclasses import replace
 from functools import partial
@@ -30,7 +30,7 @@ UPDATES = 3
 
 
 class Trained(NamedTuple):
-    """A run of some updates, and the rollout that comes next, in which episodes end."""
+    """A run after three updates, and its next rollout, in which episodes end."""
 
     program: Program
     learners: LearnerState
@@ -45,7 +45,7 @@ def _algo(config: TrainConfig, **rest: Any) -> AlgoConfig:
 
 @pytest.fixture(scope="module")
 def trained(tiny_config: TrainConfig) -> Trained:
-    """Of learners that are one for each robot, and remember."""
+    """Returns a run with one learner for each robot, each with a memory."""
     algo = _algo(tiny_config, policy="independent", memory="gru", memory_size=4)
     config = replace(tiny_config, algo=algo)
     program, schedule = programs.load(config)
@@ -56,7 +56,7 @@ def trained(tiny_config: TrainConfig) -> Trained:
     at_once, _ = chunk(schedule, first, np.int32(UPDATES))
     assert digest(to_leaves(at_once)) == digest(to_leaves(last))  # any chunk size
     waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
-    # In the middle of their episodes, which end at 16 steps.
+    # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
     _, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
@@ -64,13 +64,16 @@ def trained(tiny_config: TrainConfig) -> Trained:
 
 
 def _look(trained: Trained, arenas: EnvState) -> np.ndarray:
-    """What is around robots, as learners have it, [L, A, N, P]."""
+    """Returns the surroundings of each robot in the layout of the learners, [L, A, N, P]."""
     around = jax.vmap(partial(env.look_around, trained.program.world))(arenas)
     return np.asarray(rollout.to_learners(around, trained.program.config.learners))
 
 
 def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
-    """What critics make of arenas, put together by hand, [L, A, N]; `memory` [A, R, H]."""
+    """Returns the critics' values of the arenas, computed by hand, [L, A, N].
+
+    `memory` is [A, R, H].
+    """
     config = trained.program.config.algo
     seen, mine = (
         rollout.to_learners(x, trained.program.config.learners)
@@ -85,7 +88,7 @@ def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
 
 
 def _stepped(trained: Trained) -> Arena:
-    """The arenas after the first step of the rollout, before any reset."""
+    """Returns the arenas after the first step of the rollout, before any reset."""
     world = trained.program.world
     unpack = jax.vmap(partial(physics.unpack, world.physics))
     arenas = replace(trained.before, sim=unpack(trained.before.sim))
@@ -97,9 +100,9 @@ def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None
     seen = trained.trajectory.state
     assert seen is not None
     assert seen.shape[-1] == trained.program.state_size
-    # Two programs round differently: float32 of 2 m at most.
+    # Two compiled programs round float32 distances of at most 2 m differently.
     np.testing.assert_allclose(seen[0], _look(trained, trained.before), rtol=0, atol=1e-6)
-    # float32: single steps are another program than the scan.
+    # float32 rounding: a single step and the scan are different compiled programs.
     np.testing.assert_allclose(seen[1], _look(trained, _stepped(trained)), atol=1e-5)
 
 
@@ -111,7 +114,7 @@ def test_where_an_episode_ends_it_is_shown_the_next_one(trained: Trained) -> Non
     steps, arenas = np.nonzero(np.asarray(over)[:-1, 0, :, 0])
     assert len(steps) > 2
     for step, arena in zip(steps, arenas, strict=True):
-        # As above: rounding of two programs.
+        # Two compiled programs round differently.
         found = seen[step + 1, :, arena]
         np.testing.assert_allclose(found, first[:, arena], rtol=0, atol=1e-6)
 
@@ -120,7 +123,7 @@ def test_its_value_is_that_of_observation_and_state(trained: Trained) -> None:
     recall = trained.before.recall
     assert recall is not None
     value = _value(trained, trained.before, recall.critic)
-    # float32; a product that is batched in another way.
+    # float32 rounding of a matrix product that is batched in another way.
     np.testing.assert_allclose(trained.trajectory.value[0], value, atol=1e-5)
 
 
@@ -132,13 +135,13 @@ def test_the_next_value_is_of_what_the_step_reached(trained: Trained) -> None:
     np.testing.assert_array_equal(
         np.asarray(found.next_value)[:-1][going], np.asarray(found.value)[1:][going]
     )
-    # Where the episode ended, of its end and not of the next one's beginning.
+    # Where an episode ended, the next value is of its last state, not of the next episode's start.
     ends = np.asarray(found.next_value)[:-1][~going], np.asarray(found.value)[1:][~going]
     assert np.abs(ends[0] - ends[1]).min() > 1e-6
 
 
 def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
-    """Its first layer takes the observation alone; the critic's takes both."""
+    """The actor's first layer takes only the observation; the critic's takes the state as well."""
     params: Any = trained.learners.params
     size, more = trained.program.world.observation_size, trained.program.state_size
     layer = {side: params[side]["torso"]["hidden_0"]["kernel"] for side in params}
@@ -148,7 +151,7 @@ def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
 
 @pytest.mark.slow
 def test_seeds_side_by_side_are_those_alone(tiny_config: TrainConfig) -> None:
-    """With a memory, a state, and a policy for each robot, for one update."""
+    """Trains for one update with a memory, a critic of the state, and a policy for each robot."""
     algo = _algo(tiny_config, policy="independent", memory="gru", memory_size=4)
 
     def run(first: int, count: int) -> dict[str, np.ndarray]:
@@ -161,7 +164,7 @@ def test_seeds_side_by_side_are_those_alone(tiny_config: TrainConfig) -> None:
     together = run(0, 2)
     for lane in range(2):
         for name, leaf in run(lane, 1).items():
-            # Batched products round in another way, as in test_seeds.py.
+            # Batched matrix products round differently, as in test_seeds.py.
             np.testing.assert_allclose(together[name][lane], leaf[0], atol=1e-5, err_msg=name)
 
 
@@ -179,7 +182,7 @@ CONFIG = AlgoConfig(
 
 
 def _batch(learner: LearnerState, seed: int) -> Batch:
-    """Samples whose return follows from the state alone."""
+    """Returns samples whose return depends on the state alone."""
     keys = jax.random.split(jax.random.key(seed), 3)
     shape = (8, 32)
     observation = jax.random.normal(keys[0], (*shape, SIZE))
@@ -198,7 +201,7 @@ def _batch(learner: LearnerState, seed: int) -> Batch:
 
 
 def _learn(told: bool) -> float:
-    """Trains a critic, that is told the state or nothing of it; returns its last value loss."""
+    """Trains a critic with the state, or with zeros in its place; returns the last value loss."""
     learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
     update = jax.jit(lambda *given: ppo.update(given[0], CONFIG, *given[1:], updates=100))
     loss = np.inf
@@ -211,14 +214,14 @@ def _learn(told: bool) -> float:
 
 
 def test_a_value_that_only_the_state_tells_is_learned() -> None:
-    # Half the variance of what is to be told is 0.19.
+    # Half the variance of the returns is 0.19: the least loss without the state.
     assert _learn(told=True) < 0.02
     assert _learn(told=False) > 0.15
 
 
 @pytest.mark.parametrize("backend", ["autodiff", "blocks"])
 def test_a_state_changes_nothing_of_the_policy(backend: dispatch.Backend) -> None:
-    # Norms of gradients are clipped over both networks together: not here.
+    # No clipping here: it scales both networks by one norm, so the critic would change the actor.
     config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
     learner = ppo.init(jax.random.key(0), config, SIZE, 2, 100, STATE)
     batch = replace(_batch(learner, 0), advantage=_batch(learner, 1).return_)
@@ -257,7 +260,7 @@ def test_what_is_not_valid_may_hold_nan() -> None:
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
-# --- where it goes, and what it does not go with
+# --- settings that do not go with a critic of the state
 
 
 def test_kernels_that_know_the_observation_alone_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Arenas that are drawn again when a run goes on: what was learned and measured stays."""
+"""Checks that a run which goes on with newly drawn arenas keeps all it has learned and measured."""
 
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,7 @@ from swarmjax.training.program import Program
 
 @pytest.fixture(scope="module")
 def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, TrainState]:
-    """A state on the second stage with episodes counted, and the same with arenas drawn again."""
+    """Returns a state on the second stage with counted episodes, without and with new arenas."""
     algo = replace(tiny_config.algo, memory="gru", memory_size=4)
     program = Program(replace(tiny_config, algo=algo), tiny_world)
     schedule = programs.schedule(tiny_config)

@@ -1,4 +1,4 @@
-"""`episodes.jsonl`: every episode once, robot by robot."""
+"""Checks that `episodes.jsonl` lists every episode once, with the numbers of each robot."""
 
 import json
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from swarmjax.training import program as programs
 
 
 def _ended(done: np.ndarray, robots: int) -> Ended:
-    """Episodes [T, A] that ended where `done`; each number tells step, arena and robot."""
+    """Returns episodes [T, A] that ended where `done`; numbers encode step, arena and robot."""
     steps, arenas = done.shape
     number = 10 * np.arange(steps)[:, None] + np.arange(arenas)
     by_robot = 100 * number[..., None] + np.arange(robots)
@@ -83,7 +83,7 @@ def test_there_is_room_for_all_that_can_be_drawn() -> None:
     paper = load_train(["algo=paper"])
     assert episodes.room(paper) == 6000 // 32 + 1
     short = replace(paper, arenas=2, task=replace(paper.task, step_limit=10))
-    assert episodes.room(short) == 2 * 601  # every ten steps, and the one under way
+    assert episodes.room(short) == 2 * 601  # one every ten steps, and the running one
     assert paper.waiting < episodes.room(paper)
 
 
@@ -92,7 +92,11 @@ Train = Callable[..., None]
 
 @pytest.fixture(scope="module")
 def train_for(tiny_config: TrainConfig) -> Train:
-    """Trains on one stage into a directory, from the start or from its checkpoint, to an update."""
+    """Returns a function that trains on one stage up to an update.
+
+    The function writes into a run directory. It starts from the beginning or from the run's
+    checkpoint.
+    """
     base = replace(
         tiny_config,
         stage=tiny_config.stage[1:],
@@ -145,7 +149,8 @@ def test_sums_over_episodes_are_the_metrics(whole: Path) -> None:
         ends = [row["arena_steps"] for row in mine]
         assert ends == sorted(ends)
         assert all(64 * column["update"] < end <= column["arena_steps"] for end in ends)
-    # Episodes of 16 steps end with every second rollout of 8, in 8 arenas; few arrive before.
+    # Episodes of 16 steps end in every second rollout of 8 steps, in each of 8 arenas. Few end
+    # earlier by arrival.
     assert len(rows) >= 3 * 8
     assert any(any(row["sensed"]) for row in rows)
 
@@ -155,7 +160,7 @@ def test_a_resumed_run_writes_the_same_episodes(
 ) -> None:
     train_for(tmp_path, 4)
     with (tmp_path / "episodes.jsonl").open("a") as file:
-        # What a killed process wrote after the checkpoint, and a line that has no end.
+        # A killed process leaves a line from after the checkpoint, and an unfinished line.
         file.write('{"seed": 0, "update": 4}\n{"seed": 0, "upd')
     train_for(tmp_path, 6, resume=True)
     expected = (whole / "episodes.jsonl").read_text()

@@ -1,4 +1,4 @@
-"""What is random is drawn anew: levels every rollout, noise every step, the order every pass."""
+"""Checks that random draws differ: levels by rollout, noise by step, and sample order by epoch."""
 
 import functools
 from collections.abc import Callable
@@ -23,12 +23,15 @@ from swarmjax.training.program import Program
 
 Update = Callable[[TrainState], tuple[TrainState, Metrics]]
 
-ARENAS, STEPS = 8, 8  # of the tiny configuration; control steps of a rollout
+ARENAS, STEPS = 8, 8  # arenas of the tiny configuration; control steps of a rollout
 
 
 @pytest.fixture(scope="module")
 def program(tiny_config: TrainConfig) -> Program:
-    """One robot an arena, which compiles sooner; an episode is over at the end of each rollout."""
+    """Returns a program whose episodes all end with each rollout.
+
+    The program has one robot in each arena, which compiles faster.
+    """
     algo = replace(
         tiny_config.algo, hidden_sizes=(4,), epochs=1, num_minibatches=4, max_grad_norm=None
     )
@@ -54,7 +57,7 @@ def update(program: Program) -> Update:
 
 
 def _with_mean(state: TrainState, action: float) -> TrainState:
-    """Has the policy's mean be one action whatever is observed, with deviation 1."""
+    """Returns the state with a policy of a constant mean action and of deviation 1."""
     params = state.learners.params
     actor: Any = jax.tree.map(jnp.zeros_like, params["actor"])
     actor["mean"]["bias"] += action
@@ -62,13 +65,13 @@ def _with_mean(state: TrainState, action: float) -> TrainState:
 
 
 def _critic(state: TrainState) -> np.ndarray:
-    """All parameters of the critic, side by side."""
+    """Returns all parameters of the critic as one vector."""
     leaves = jax.tree.leaves(state.learners.params["critic"])
     return np.concatenate([np.ravel(leaf) for leaf in leaves])
 
 
 def test_every_rollout_draws_levels_of_its_own(start: TrainState, update: Update) -> None:
-    """All episodes are over after a rollout, and the next has those that were drawn for it."""
+    """All episodes end with a rollout, so the next rollout plays the levels drawn for it."""
     state, starts = start, []
     for _ in range(3):
         state, _ = update(state)
@@ -82,32 +85,32 @@ def test_every_control_step_of_a_rollout_has_noise_of_its_own(
     collect = jax.jit(functools.partial(rollout.collect, program))
     learners = _with_mean(start, 0.0).learners
     _, trajectory, _ = collect(learners, start.arenas, start.arenas, jax.random.key(0))
-    # With mean 0 and deviation 1 an action is its noise.
+    # With mean 0 and deviation 1, an action equals its noise.
     actions = np.asarray(trajectory.action)
     assert actions.shape == (STEPS, 1, ARENAS, 1, 2)
     assert len(np.unique(actions)) == actions.size
 
 
 def test_every_rollout_has_noise_of_its_own(start: TrainState, update: Update) -> None:
-    """Levels play no part: those of the rollout are there, and the next begin after it."""
+    """Both rollouts play the same levels, since newly drawn levels begin only after a rollout."""
     begun = _with_mean(start, 0.0)
     one, seen = update(begun)
-    _, seen_too = update(replace(begun, key=one.key))  # the key of the update after it
+    _, seen_too = update(replace(begun, key=one.key))  # the key of the next update
     assert seen["reward"] != seen_too["reward"]
 
 
 def test_every_update_shuffles_in_an_order_of_its_own(start: TrainState, update: Update) -> None:
-    """What the robots do is the same in both: an action of 100 is full speed with any noise."""
+    """Robots move the same in both rollouts: an action near 100 is full speed with any noise."""
     begun = _with_mean(start, 100.0)
     one, seen = update(begun)
-    other, seen_too = update(replace(begun, key=one.key))  # the key of the update after it
+    other, seen_too = update(replace(begun, key=one.key))  # the key of the next update
     assert seen["robot_steps"] == seen_too["robot_steps"]
     assert seen["reward"] == seen_too["reward"]
     assert np.any(_critic(other) != _critic(one))
 
 
 def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
-    """Two of four groups are valid: in one minibatch they are one step, in two they are two."""
+    """Two of four groups are valid: an epoch takes one step if one minibatch has both, else two."""
     epochs, groups = 12, 4
     config = AlgoConfig(hidden_sizes=(4,), epochs=epochs, num_minibatches=2)
     learner = ppo.init(jax.random.key(0), config, 3, 2, 1)
@@ -123,5 +126,5 @@ def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
     learned, _ = jax.jit(lambda key: ppo.update(learner, config, batch, key, 1))(jax.random.key(1))
     counts = optax.tree.get_all_with_path(learned.optimizer_state, "count")
     (steps,) = {int(count) for _, count in counts}
-    # In the same order every time it would be 12 or 24.
+    # With the same order in every epoch, there would be 12 or 24 steps.
     assert epochs < steps < 2 * epochs

@@ -1,4 +1,4 @@
-"""Robots that hear, in training: runs bit for bit, and the policy that comes out."""
+"""Checks training of robots that hear: resumed runs bit for bit, and the policy file."""
 
 from pathlib import Path
 

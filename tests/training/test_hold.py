@@ -1,4 +1,4 @@
-"""`task.arrival=hold` in training: what a rollout hands to the learners, and that they learn."""
+"""Checks training with `task.arrival=hold`: the samples of a rollout, and that a swarm learns."""
 
 import dataclasses
 import functools
@@ -22,11 +22,11 @@ from swarmjax.training.program import ACTION_SIZE, Program
 from swarmjax.training.rollout import Arena, Trajectory
 
 ALL, ONE, GOING = range(3)  # arenas
-STEPS = 8  # of a rollout of the tiny configuration, whose episodes end at 16
+STEPS = 8  # control steps of a rollout in the tiny configuration, whose episodes end at 16
 
 
 class Run(NamedTuple):
-    """A rollout of three arenas: [T, 1, 3, R, ...] and [T, 3]."""
+    """A rollout of three arenas: the trajectory, [T, 1, 3, R, ...], and ended episodes, [T, 3]."""
 
     trajectory: Trajectory
     ended: Ended
@@ -34,7 +34,11 @@ class Run(NamedTuple):
 
 @pytest.fixture(scope="module")
 def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
-    """Arenas in which all robots are at their targets, or one is and the time runs out or not."""
+    """Returns a rollout of three arenas.
+
+    In the first arena, all robots are at their targets. In the other two, one robot is, and the
+    first step of the second arena reaches the step limit.
+    """
     task = dataclasses.replace(tiny_config.task, arrival="hold")
     config = dataclasses.replace(tiny_config, task=task)
     program = Program(config, dataclasses.replace(tiny_world, task=task))
@@ -71,7 +75,7 @@ def test_at_the_step_limit_whoever_is_there_is_cut_as_the_others_are(run: Run) -
 
 def test_robots_at_their_targets_are_learned_from(run: Run) -> None:
     assert run.trajectory.valid[:, 0, GOING, :2].all()
-    assert not run.trajectory.valid[..., 2].any()  # which takes no part
+    assert not run.trajectory.valid[..., 2].any()  # this robot is absent
 
 
 def test_what_ended_counts_who_is_there_at_the_end(run: Run) -> None:
@@ -80,13 +84,13 @@ def test_what_ended_counts_who_is_there_at_the_end(run: Run) -> None:
     assert ended.targets[0].tolist() == [2, 2, 0]
     assert ended.reached[0].tolist() == [2, 1, 0]
     assert ended.all_reached[0].tolist() == [1, 0, 0]
-    # Nobody had arrived when the episodes began: one step each outside.
+    # No robot had arrived when the episodes began, so each robot counts one step before arrival.
     assert ended.robot_steps[0].tolist() == [2, 2, 0]
 
 
 @pytest.mark.slow
 def test_a_swarm_learns_to_hold(tmp_path: Path) -> None:
-    """On the easiest stage, where the share of complete episodes begins near 0."""
+    """Trains on the easiest stage, where the share of complete episodes begins near 0."""
     found = swarmjax.train_policy(
         {
             "stage": "s1",
@@ -98,6 +102,7 @@ def test_a_swarm_learns_to_hold(tmp_path: Path) -> None:
     )
     complete = [row["complete_by_stage"][0] for row in found.metrics]
     measured = [share for share in complete if share is not None]
-    # Of seeds 0 to 3 the first whole cohort had 0.06 to 0.39 complete, and the last 0.98 to 0.99.
+    # With seeds 0 to 3, the share was 0.06 to 0.39 in the first whole cohort, and 0.98 to 0.99 in
+    # the last.
     assert measured[0] < 0.5
     assert measured[-1] > 0.9

@@ -1,4 +1,4 @@
-"""A curriculum over levels in a real training: one trace, any chunk size, the same levels again."""
+"""Checks a curriculum over levels in training: one trace, any chunk size, and replayed levels."""
 
 import itertools
 from collections.abc import Callable
@@ -28,7 +28,7 @@ UPDATES = 20
 
 
 class Trained(NamedTuple):
-    """A run of twenty updates, one by one: states before each and after all, and its chunk."""
+    """A run of twenty single updates, with the state before each update and after the last."""
 
     program: Program
     schedule: Schedule
@@ -70,7 +70,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
         return loop.train_chunk(program, schedule, state, jnp.asarray(n))
 
     jitted, init = jax.jit(chunk), partial(loop.init, program)
-    # As a checkpoint gives them back, whose numbers have no weak types.
+    # The first state is as restored from a checkpoint, whose numbers have no weak types.
     first = from_leaves(to_leaves(jax.jit(init)(schedule)), jax.eval_shape(init, schedule))
     states, rows = [first], []
     for _ in range(UPDATES):
@@ -98,7 +98,7 @@ def test_a_run_goes_on_from_a_checkpoint_bit_for_bit(trained: Trained) -> None:
 
 
 def test_the_numbers_are_no_part_of_the_program(trained: Trained) -> None:
-    """A later trace would fail in `chunk`, which allows one; the numbers must matter as well."""
+    """Changes the numbers: `chunk` fails if they need a second trace, and the run must differ."""
     levels = trained.schedule.levels
     assert levels is not None
     other = levels._replace(
@@ -131,7 +131,7 @@ def test_the_buffer_fills_and_is_played_from(trained: Trained) -> None:
 
 
 def test_episodes_of_the_buffer_speak_for_no_stage(trained: Trained) -> None:
-    """What the curriculum over stages counts are the episodes on levels that are drawn for them."""
+    """Checks that the curriculum over stages counts only episodes on newly drawn levels."""
     for state in trained.states:
         source = _source(state)
         fresh = np.asarray(source.slot) == FRESH
@@ -142,7 +142,7 @@ def test_episodes_of_the_buffer_speak_for_no_stage(trained: Trained) -> None:
 
 
 def test_an_arena_is_on_the_level_that_its_numbers_say(trained: Trained) -> None:
-    """To the last bit, whether it was drawn, is played again or was mutated."""
+    """Checks all bits of newly drawn, replayed and mutated levels."""
     world, stages = trained.program.world, jax.tree.map(jnp.asarray, trained.schedule.stages)
 
     @jax.jit
@@ -171,7 +171,7 @@ def test_a_level_of_the_buffer_is_where_its_arenas_look_for_it(trained: Trained)
 
 
 def test_outcomes_of_a_rollout_are_those_of_its_episodes(trained: Trained) -> None:
-    """Worked out in NumPy, arena by arena, from what the rollout says has ended."""
+    """Computes the outcomes in NumPy, arena by arena, from the ended episodes of the rollout."""
     program, state = trained.program, trained.states[-1]
     waiting = loop._draw_waiting(program, trained.schedule, state.curriculum, jax.random.key(5))
     collect = jax.jit(partial(rollout.collect, program))

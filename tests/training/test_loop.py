@@ -1,4 +1,4 @@
-"""The compiled loop: one trace, any chunk size, every stage."""
+"""Checks the compiled loop: one trace, any chunk size, every stage."""
 
 import itertools
 from collections.abc import Callable
@@ -37,7 +37,7 @@ def start(program: Program) -> Callable[[], TrainState]:
 
 @pytest.fixture(scope="module")
 def chunk(program: Program) -> Chunk:
-    """Traces `loop.train_chunk` once for all tests of this module, or fails."""
+    """Returns the jitted `loop.train_chunk`; tracing it twice in this module is an error."""
     return _traced_once(program)
 
 
@@ -77,7 +77,7 @@ def test_a_run_trains_and_reports_one_row_an_update(
     before, after = to_leaves(start()), to_leaves(state)
     name = "learners/params/actor/mean/kernel"
     assert np.max(np.abs(before[name] - after[name])) > 1e-4
-    # 8 arenas of two robots for 8 control steps; those that arrive early add fewer.
+    # 8 arenas of two robots run for 8 control steps; robots that arrive early add fewer.
     assert 0 < metrics["transitions"][0] <= 8 * 2 * 8
     assert set(np.asarray(metrics["broken_arenas"][:5])) == {0}
 
@@ -85,19 +85,19 @@ def test_a_run_trains_and_reports_one_row_an_update(
 def test_stage_numbers_are_no_part_of_the_program(
     program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
-    """A later trace would fail in `chunk`, which allows one; the numbers must matter as well."""
+    """Changes the numbers: `chunk` fails if they need a second trace, and the run must differ."""
     schedule = programs.schedule(program.config)
     wider = schedule._replace(stages=schedule.stages._replace(side=schedule.stages.side * 1.5))
     state, _ = chunk(schedule, start(), np.int32(20))
     other, _ = chunk(wider, start(), np.int32(20))
     sides = {round(float(side), 3) for side in np.asarray(other.arenas.level.side)}
-    assert sides <= {0.5, 0.75, 1.2}  # 0.5: drawn by `start`, still running
+    assert sides <= {0.5, 0.75, 1.2}  # 0.5: levels drawn by `start`, still in play
     assert 0.75 in sides or 1.2 in sides
     assert digest(to_leaves(state)) != digest(to_leaves(other))
 
 
 def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
-    """All six stages of the default."""
+    """Returns a config with all six stages of the default curriculum."""
     sizes = [(2, 0.5, 0), (2, 0.7, 0), (3, 0.7, 1), (3, 1.0, 2), (5, 1.0, 2), (5, 1.2, 3)]
     stages = tuple(
         StageConfig(name=f"s{i + 1}", robots=robots, side=side, obstacles=obstacles)
@@ -113,7 +113,7 @@ def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
 
 
 def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
-    """Promoted by deadline, since nothing is learned so fast."""
+    """Promotes by deadline, since nothing is learned in so few updates."""
     options = CurriculumConfig(mode="sequential", threshold=1.0, budget_share=0.8)
     program, schedule = programs.load(_six(tiny_config, options))
     chunk = _traced_once(program)
@@ -121,7 +121,7 @@ def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainCo
     state, metrics = chunk(schedule, state, np.int32(10))
     state, more = chunk(schedule, state, np.int32(15))
     visited = np.concatenate([metrics["stage"][:10], more["stage"][:15]])
-    # 20 updates for the first five stages, four each: a deadline of 4, 8, 12, 16 and 20.
+    # The first five stages share 20 updates, four each: deadlines at 4, 8, 12, 16 and 20.
     np.testing.assert_array_equal(visited, np.repeat(np.arange(6), [4, 4, 4, 4, 4, 5]))
     assert set(np.asarray(state.arenas.stage)) <= {4, 5}
     assert int(np.max(np.sum(state.arenas.level.present, axis=-1))) == 5
@@ -136,14 +136,15 @@ def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: Trai
     schedule = schedule._replace(deadline=np.array([3, 8, *[NEVER] * 4], np.int32))
     _, metrics = chunk(schedule, init(schedule), np.int32(20))
     np.testing.assert_array_equal(metrics["stage"][:20], np.repeat([0, 1, 2], [3, 5, 12]))
-    # Half of the 8 arenas on the third stage, a quarter on each before it; those still under way
-    # from an earlier stage have ended after a step limit.
+    # Half of the 8 arenas are on the third stage, and a quarter on each stage before it. Episodes
+    # that began before the last promotion have ended after a step limit.
     np.testing.assert_allclose(metrics["weights"][19], [0.25, 0.25, 0.5, 0, 0, 0], rtol=1e-6)
     assert metrics["mix"][12:20].sum(axis=0).tolist()[3:] == [0, 0, 0]
     assert (metrics["mix"][12:20].sum(axis=1) == 8).all()
-    # Eight arenas, whose points move on from cohort to cohort: within one of their share.
+    # The points that place eight arenas on stages move with each cohort, so each stage's mean
+    # number of arenas is within one of its share.
     np.testing.assert_allclose(metrics["mix"][12:20].mean(axis=0)[:3], [2, 2, 4], atol=1)
-    # Other numbers of everything are no other program.
+    # Other numbers throughout the schedule need no second trace.
     other = schedule._replace(
         threshold=np.float32(0.1),
         demotion=np.float32(0.05),
@@ -164,11 +165,11 @@ def test_adaptive_trains_on_all_stages_within_one_trace(tiny_config: TrainConfig
     assert set(np.asarray(metrics["stage"])) == {5}
     weights = np.asarray(metrics["weights"])
     assert (weights.min(axis=1) >= 0.1 / 6 - 1e-6).all()  # float32
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-6)  # likewise
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-6)  # float32
     decided = np.flatnonzero(metrics["decision"])
-    # A cohort is two updates; the first verdict falls at the end of the second.
+    # A cohort is two updates; the first decision is made at the end of the second cohort.
     assert decided.tolist() == list(range(3, 25, 2))
-    # 8 arenas come round to all six stages.
+    # Over the run, the 8 arenas visit all six stages.
     assert (np.asarray(metrics["episodes_by_stage"])[-1] > 0).all()
     other = schedule._replace(floor=np.float32(1.0), cohort_updates=np.int32(3))
     _, metrics = chunk(other, init(other), np.int32(25))
@@ -194,7 +195,7 @@ def test_metrics_by_stage_are_the_record(
         np.testing.assert_array_equal(metrics[name][19], expected, err_msg=name)
     on = np.bincount(np.asarray(state.arenas.stage), minlength=2)
     np.testing.assert_array_equal(metrics["mix"][19], on)
-    # Half of 20 updates for the first stage of two, unless it was left before.
+    # The first of two stages lasts for half of the 20 updates, unless it ends earlier.
     last = int(np.asarray(metrics["decision"]).nonzero()[0][0])
     assert last <= 9
     moved = [int(metrics[name][last]) for name in ("decided_stage", "next_stage")]
@@ -206,7 +207,7 @@ def test_a_seed_may_be_given(program: Program, start: Callable[[], TrainState]) 
     schedule = programs.schedule(program.config)
     init = jax.jit(partial(loop.init, program))
     same, other = init(schedule, np.int32(0)), init(schedule, np.int32(1))
-    assert digest(to_leaves(same)) == digest(to_leaves(start()))  # the config's is 0
+    assert digest(to_leaves(same)) == digest(to_leaves(start()))  # the config's seed is 0
     assert digest(to_leaves(other)) != digest(to_leaves(same))
     configured = replace(program, config=replace(program.config, seed=1))
     again = jax.jit(partial(loop.init, configured))(schedule)
@@ -218,7 +219,10 @@ Independent = tuple[Callable[[], TrainState], Callable[..., tuple[TrainState, di
 
 @pytest.fixture(scope="module")
 def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
-    """Robots with a learner each; the third joins at the deadline of the first stage."""
+    """Returns functions that start and train a run with one learner for each robot.
+
+    The third robot joins at the deadline of the first stage.
+    """
     config = replace(
         tiny_config,
         algo=replace(tiny_config.algo, policy="independent"),
@@ -242,7 +246,7 @@ def test_independent_robots_learn_apart(independent: Independent) -> None:
 
 
 def test_newcomers_start_from_what_the_others_learned(independent: Independent) -> None:
-    """The deadline falls after ten updates, half of all."""
+    """The deadline comes after ten updates, which is half of the run."""
     start, train = independent
     before, metrics = train(start(), np.int32(9))
     after, decided = train(before, np.int32(1))

@@ -1,4 +1,4 @@
-"""Robots that remember, in training: what the learners recompute, and runs bit for bit."""
+"""Checks training with memory: the outputs that learners recompute, and runs bit for bit."""
 
 from dataclasses import replace
 from functools import partial
@@ -30,7 +30,7 @@ SIZE, UPDATES = 4, 6
 
 
 class Trained(NamedTuple):
-    """A run of some updates, one by one, and the rollout that comes next."""
+    """A run of six single updates, and its next rollout."""
 
     program: Program
     states: list[TrainState]
@@ -59,7 +59,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     last = states[-1]
     waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
     collect = jax.jit(partial(rollout.collect, program))
-    # In the middle of their episodes, which end at 16 steps.
+    # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     arenas, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
     batch = rollout.batch(trajectory, config.algo, memory=before.recall)
@@ -74,15 +74,15 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     config, learners = trained.program.config.algo, trained.states[-1].learners
     batch = jax.tree.map(lambda x: x[0], trained.batch)
     samples = ppo._samples(_one(learners), config, batch, ppo.ALONE)
-    # Arenas in another order, as minibatches have them.
+    # The arenas are in another order, as in minibatches.
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
     mean, std, value = losses.evaluate(_one(learners).params, config, minibatch)
     log_prob = networks.log_prob(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
-    assert np.asarray(trained.trajectory.over).any()  # episodes end within it
-    tolerance = {"rtol": 0, "atol": 2e-6}  # float32; products of a batch of another size
+    assert np.asarray(trained.trajectory.over).any()  # episodes end within the rollout
+    tolerance = {"rtol": 0, "atol": 2e-6}  # float32; matrix products of another batch size
     np.testing.assert_allclose(log_prob[valid], minibatch.log_prob[valid], **tolerance)
     seen = np.asarray(trained.trajectory.value[:, 0])[:, rows].reshape(-1)
     np.testing.assert_allclose(value[valid], seen[valid], **tolerance)
@@ -109,13 +109,13 @@ def test_a_memory_is_trained(trained: Trained) -> None:
 
 
 class Seen(NamedTuple):
-    """A rollout of robots with a history of three, by learners that have not learned."""
+    """A rollout of robots with a history of three observations, by untrained learners."""
 
     config: TrainConfig
     state: TrainState
     observation: np.ndarray  # [T + 1, A, R, 3 O]
     over: np.ndarray  # [T, A] whether the episode ended with the step
-    action: np.ndarray  # [T, A, R, U] of the first steps, the most likely ones
+    action: np.ndarray  # [T, A, R, U], the most likely action of each of the T steps
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def stacked(tiny_config: TrainConfig, tiny_world: World) -> Seen:
     schedule = programs.schedule(program.config)
     first = jax.jit(partial(loop.init, program))(schedule)
     waiting = loop._draw_waiting(program, schedule, first.curriculum, jax.random.key(1))
-    # In the middle of their episodes, which end at 16 steps.
+    # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(first.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
     after, found, ended = collect(first.learners, before, waiting, jax.random.key(2))
@@ -143,7 +143,7 @@ def test_a_rollout_sees_what_was_seen_before_and_forgets_where_an_episode_begins
     over = stacked.over[..., None, None]
     assert over.any()
     for age in (1, 2):
-        # What is kept moves on by one place, and is gone where another episode has begun.
+        # Each step moves the history by one place, and a new episode begins with a history of 0.
         np.testing.assert_array_equal(looks[age][1:], np.where(over, 0.0, looks[age - 1][:-1]))
     assert (np.abs(looks[2][-1]).max(axis=(1, 2)) > 0.0).sum() == 8 - over[-2:].any(axis=0).sum()
 
@@ -151,7 +151,7 @@ def test_a_rollout_sees_what_was_seen_before_and_forgets_where_an_episode_begins
 def test_the_file_of_a_policy_with_a_history_keeps_it_by_itself(
     stacked: Seen, tmp_path: Path
 ) -> None:
-    """The file's policy is handed one observation after the other, as where it is deployed."""
+    """Gives the file's policy one observation after the other, as in deployment."""
     leaves = {name: leaf[None] for name, leaf in to_leaves(stacked.state).items()}
     write_policy(tmp_path / "policy.npz", leaves, stacked.config, update=0, seed=0)
     trained = policy_file.read(tmp_path / "policy.npz")

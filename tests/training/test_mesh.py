@@ -1,4 +1,4 @@
-"""A run over two devices, in one process and in two, comes to what it does on one."""
+"""Checks that a run on two devices, in one or two processes, matches the run on one device."""
 
 import os
 import socket
@@ -15,9 +15,9 @@ SCRIPT = Path(__file__).with_name("two_devices.py")
 Found = dict[str, np.ndarray]
 
 PLAIN = ""
-# All that a run may have besides: a memory, and a critic that sees the state.
+# Optional parts of a run: a memory, and a critic that sees the state.
 REMEMBERS = "algo.memory=gru algo.memory_size=8 algo.critic=state"
-# A buffer of levels, which every device holds whole.
+# A buffer of levels, of which every device holds a full copy.
 LEVELS = "curriculum.levels.mode=value_loss curriculum.levels.buffer=60"
 
 
@@ -46,13 +46,13 @@ def _end(*processes: subprocess.Popen[str]) -> None:
     ids=["plain", "remembers", "levels"],
 )
 def words(request: pytest.FixtureRequest) -> str:
-    """What the run is told."""
+    """Returns the words of the config that the run gets."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def alone(words: str, tmp_path_factory: pytest.TempPathFactory) -> Found:
-    """The run on one device, with the random streams of two."""
+    """Returns the results of the run on one device, with the random streams of two devices."""
     out = tmp_path_factory.mktemp("alone") / "found.npz"
     _end(_start(out, 1, words))
     return dict(np.load(out))
@@ -64,7 +64,7 @@ def alone(words: str, tmp_path_factory: pytest.TempPathFactory) -> Found:
 def spread(
     request: pytest.FixtureRequest, words: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Found:
-    """The run on two devices."""
+    """Returns the results of the run on two devices."""
     out = tmp_path_factory.mktemp("spread") / "found.npz"
     if request.param == "one process":
         _end(_start(out, 2, words, forced=2))
@@ -80,8 +80,8 @@ def test_learners_are_the_same(alone: Found, spread: Found) -> None:
     learned = [name for name in alone if name.startswith(".params")]
     assert len(learned) > 10
     for name in learned:
-        # Sums of float32 in another order, through 160 steps of Adam: 2e-5 were seen. A statistic
-        # of one device alone moves them by more than a hundredth.
+        # float32 sums in another order make parameters differ by 2e-5 after 160 steps of Adam, as
+        # measured. A statistic over one device alone would change them by more than a hundredth.
         np.testing.assert_allclose(spread[name], alone[name], rtol=0.0, atol=2e-4, err_msg=name)
 
 
@@ -92,7 +92,7 @@ def test_the_curriculum_decides_the_same(alone: Found, spread: Found, name: str)
 
 def test_an_update_sums_once_a_minibatch_and_five_times_more(alone: Found, spread: Found) -> None:
     assert int(alone["sums"]) == 0
-    assert int(spread["sums"]) == 1 + 5  # the first is in the loop over minibatches
+    assert int(spread["sums"]) == 1 + 5  # 1 in the loop over minibatches
 
 
 def test_every_device_has_the_same_levels(words: str, alone: Found, spread: Found) -> None:

@@ -1,4 +1,4 @@
-"""What a promotion leaves of the learners, leaf by leaf."""
+"""Checks what a promotion changes in the learners, leaf by leaf."""
 
 from dataclasses import replace
 from typing import Any
@@ -35,7 +35,7 @@ def config(tiny_config: TrainConfig) -> TrainConfig:
 
 @pytest.fixture(scope="module")
 def learners(config: TrainConfig) -> LearnerState:
-    """Five learners that have learned something, each something else."""
+    """Returns five learners after one update, each from its own batch."""
     updates = config.updates
     keys = jax.random.split(jax.random.key(0), LEARNERS)
     start = jax.vmap(lambda key: ppo.init(key, ALGO, OBSERVED, 2, updates))(keys)
@@ -79,7 +79,8 @@ RESET = {"optimizer": "reset", "normalizer": "relearn", "exploration": "reset"}
 
 def test_newcomers_take_over_in_turn(config: TrainConfig, learners: LearnerState) -> None:
     found = _promote(learners, config, before=2, after=5)
-    # Robots 0 and 1 trained; 2, 3 and 4 copy 0, 1 and 0: parameters, optimiser, normaliser.
+    # Robots 0 and 1 have trained. Robots 2, 3 and 4 copy the parameters, the optimiser and the
+    # normaliser of robots 0, 1 and 0.
     _assert_same(found, jax.tree.map(lambda x: x[np.array([0, 1, 0, 1, 0])], learners))
     kernel = np.asarray(found.params["actor"]["mean"]["kernel"])
     assert not np.array_equal(kernel[0], kernel[1])
@@ -139,7 +140,7 @@ def test_normalizer_forgets_with_the_next_batch(
     seen = np.array([[1.0, 2.0, 30.0], [3.0, 2.0, 10.0]], np.float32)
     one = jax.tree.map(lambda x: x[0], found.normalizer)
     after = normalizer.update(one, jnp.asarray(seen), jnp.ones(2, bool))
-    # The batch alone; rounding of float32, of means that were elsewhere before.
+    # The moments are those of the batch alone, up to float32 rounding of the old means.
     np.testing.assert_allclose(after.mean, [2.0, 2.0, 20.0], rtol=1e-6)
     np.testing.assert_allclose(after.variance, [1.0, 0.0, 100.0], rtol=1e-6, atol=1e-6)
 
@@ -148,7 +149,7 @@ def test_exploration(config: TrainConfig, learners: LearnerState) -> None:
     before = learners.params["actor"]["log_std"]
     assert np.abs(np.exp(before) - 0.5).max() > 1e-4  # it has moved
     found = _promote(learners, config, exploration="reset")
-    # initial_std of the config; rounding of float32.
+    # 0.5 is the config's initial_std, up to float32 rounding.
     np.testing.assert_allclose(np.exp(found.params["actor"]["log_std"]), 0.5, rtol=1e-6)
     kept = found.params["actor"] | {"log_std": before}
     _assert_same(replace(found, params=found.params | {"actor": kept}), learners)

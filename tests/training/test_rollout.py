@@ -1,4 +1,4 @@
-"""One rollout replayed step by step, and the layouts that the learners see."""
+"""Checks a rollout against a replay in single steps, and the layouts that the learners see."""
 
 import dataclasses
 import functools
@@ -32,12 +32,12 @@ Draw = Callable[[int, int], Arena]
 T, ARENAS, ROBOTS, LIMIT = 8, 8, 3, 16  # of the tiny configuration
 HULL, RANGE = 0.037, 0.04  # m
 ARRIVES, BUMPS, BROKEN = 1, 2, 7  # arenas
-CLOCK = [0, 0, 9, 10, 11, 12, 13, 0]  # at the start; an episode ends at 16
-NOW, NEXT = 4, 5  # cohorts of the episodes that run and of those that wait
+CLOCK = [0, 0, 9, 10, 11, 12, 13, 0]  # control steps at the start; an episode ends at 16
+NOW, NEXT = 4, 5  # cohorts of the running and of the waiting episodes
 
 
 class Run(NamedTuple):
-    """A rollout: what it began with and what came of it."""
+    """A rollout, with its inputs and its results."""
 
     learners: LearnerState
     before: Arena
@@ -48,7 +48,7 @@ class Run(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """The same actions, one compiled step at a time: [T, A, ...]."""
+    """The results of the same actions, from single compiled steps: [T, A, ...]."""
 
     came: TimeStep
     seen: np.ndarray  # what was observed before each step
@@ -74,7 +74,7 @@ def learners(tiny_config: TrainConfig) -> LearnerState:
 
 @pytest.fixture(scope="module")
 def draw(tiny_config: TrainConfig, tiny_world: World) -> Draw:
-    """Draws starts of either stage in turn, from a seed, for a cohort."""
+    """Returns a function of a seed and a cohort that draws starts of the two stages in turn."""
     stages, index = task_stage.stack(tiny_config.stage), jnp.arange(ARENAS)[None] % 2
     draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, index))
     return lambda seed, cohort: draw(jnp.int32(cohort), jax.random.key(seed))
@@ -82,7 +82,11 @@ def draw(tiny_config: TrainConfig, tiny_world: World) -> Draw:
 
 @pytest.fixture(scope="module")
 def before(tiny_world: World, draw: Draw) -> Arena:
-    """Arenas in the middle of their episodes; in one all arrive, one drives into a wall."""
+    """Returns arenas in the middle of their episodes.
+
+    In one arena all robots arrive, in one a robot drives into a wall, and in one a robot has an
+    infinite velocity.
+    """
     drawn = draw(0, NOW)
     pose, target = drawn.level.start[ARRIVES], drawn.level.target
     toward = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
@@ -126,20 +130,20 @@ def replay(tiny_world: World, run: Run, tiny_step: ArenaStep) -> Replay:
         state, came = tiny_step(state, jnp.asarray(action))
         pose = jax.vmap(functools.partial(physics.poses, tiny_world.physics))(state.sim)
         rows.append((came, seen, pose, came.done))
-        # All of the waiting episode, and not only what is packed of it.
+        # A waiting episode begins with its whole state, and not only with the packed part.
         state = jax.tree.map(functools.partial(_where, came.done), waiting, state)
     came, observed, pose, fresh = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
     return Replay(came, observed, pose, fresh, state)
 
 
 def _values(config: TrainConfig, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
-    """Values [..., A, R] by the one learner."""
+    """Returns the values [..., A, R] of the only learner."""
     one = jax.tree.map(lambda leaf: leaf[0], learners)
     return np.asarray(ppo.values(one, config.algo, jnp.asarray(seen)))
 
 
 def _at[Tree](tree: Tree, where: Any) -> Tree:
-    """One arena, one step, or a part of them."""
+    """Indexes all leaves, for example by a step or an arena."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[where], tree)
 
 
@@ -166,7 +170,7 @@ def test_each_robot_has_its_learner() -> None:
 
 
 def _random_trajectory(shape: tuple[int, int, int, int]) -> Trajectory:
-    """Random numbers [T, L, A, N, ...], with ends of both kinds and samples that are not valid."""
+    """Returns random numbers [T, L, A, N, ...], with ends of both kinds and invalid samples."""
     random = np.random.default_rng(0)
     end = random.random(shape)
     trajectory = Trajectory(
@@ -210,7 +214,7 @@ def test_a_step_limit_may_be_terminal_to_bootstrapped_returns() -> None:
     trajectory = _random_trajectory((20, 2, 3, 1))
     config = AlgoConfig(discount=0.9, time_out="terminal")
     found = rollout.batch(trajectory, config).return_[..., 0]
-    # Where physics broke, which is not valid, the value still stands for the rest.
+    # A sample where physics broke is truncated and not valid. Its return still bootstraps.
     timed_out = trajectory.truncated & trajectory.valid
     terminal = trajectory._replace(terminated=trajectory.terminated | timed_out)
     expected = rollout.batch(terminal, AlgoConfig(discount=0.9)).return_[..., 0]
@@ -227,15 +231,15 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
     reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:9])
     following, returns = np.zeros(shape[1:]), np.zeros(shape)
     for t in reversed(range(shape[0])):
-        # A step limit that leaks is no end; physics that broke always is.
+        # With time_out=leak, a step limit ends no return; broken physics always ends it.
         cut = truncated[t] if time_out == "terminal" else truncated[t] & ~valid[t]
         following = reward[t] + 0.9 * np.where(terminated[t] | cut, 0.0, following)
         returns[t] = following
-    for learner in range(2):  # each over its own samples
+    for learner in range(2):  # each normalises over its own samples
         mine = np.s_[:, learner, :, 0]
         inside = returns[mine][valid[mine]]
         normal = (returns[mine] - inside.mean()) / (inside.std(ddof=1) + 1e-7)
-        # Float32 of sums of up to ten rewards of order 1.
+        # float32 sums of up to ten rewards of order 1.
         np.testing.assert_allclose(found.return_[learner], normal.T, atol=5e-6)
         advantage = normal - np.asarray(trajectory.value[mine])
         np.testing.assert_allclose(found.advantage[learner], advantage.T, atol=5e-6)
@@ -248,7 +252,7 @@ def test_starts_are_of_the_stage_they_are_asked_for(draw: Draw) -> None:
     state = draw(3, NEXT)
     assert state.stage.tolist() == [0, 1] * 4
     assert state.cohort.tolist() == [NEXT] * ARENAS
-    # The first stage has 2 robots in 0.5 m, the second 3 and 2 obstacles in 0.8 m.
+    # The first stage has 2 robots in 0.5 m. The second has 3 robots and 2 obstacles in 0.8 m.
     assert state.level.present.sum(axis=-1).tolist() == [2, 3] * 4
     assert state.level.obstacle_present.sum(axis=-1).tolist() == [0, 2] * 4
     np.testing.assert_array_equal(state.level.side, np.float32([0.5, 0.8] * 4))
@@ -276,7 +280,7 @@ def test_restart_puts_the_waiting_episode_into_arenas_that_are_over(
     jax.tree.map(check, packed, run.starts, run.before)
 
 
-# --- what is not finite
+# --- numbers that are not finite
 
 
 SPOILT = 3  # arena
@@ -285,7 +289,7 @@ Collect = Callable[[Arena], tuple[Arena, Trajectory, Ended]]
 
 @pytest.fixture(scope="module")
 def collect(program: Program, draw: Draw, learners: LearnerState) -> Collect:
-    """Drives arenas for one rollout."""
+    """Returns a function that runs one rollout of given arenas."""
     found = jax.jit(functools.partial(rollout.collect, program))
     return lambda arenas: jax.tree.map(
         np.asarray, found(learners, arenas, draw(1, NEXT), jax.random.key(2))
@@ -293,7 +297,7 @@ def collect(program: Program, draw: Draw, learners: LearnerState) -> Collect:
 
 
 def _spoil(arenas: Arena, field: str, value: float) -> Arena:
-    """Puts a value into one robot of one arena."""
+    """Returns arenas in which this field of one robot has this value."""
     if field in ("qpos", "qvel"):
         sim = arenas.sim._replace(**{field: getattr(arenas.sim, field).at[SPOILT, 1].set(value)})
         return dataclasses.replace(arenas, sim=sim)
@@ -308,7 +312,7 @@ def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
     begun = draw(0, NOW)
     sound, broken = collect(begun), collect(_spoil(begun, field, value))
     after, trajectory, ended = broken
-    # It breaks once, in the first step, and all that follows of it is sound.
+    # The arena breaks once, in the first step, and its later samples are valid.
     assert ended.broken.sum(axis=1).tolist() == [1] + [0] * (T - 1)
     assert ended.broken[0, SPOILT] == 1
     assert not trajectory.valid[0, 0, SPOILT].any()
@@ -317,7 +321,7 @@ def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
     assert np.isfinite(ended.reward).all()
     for leaf in jax.tree.leaves((after.sim, after.observation, after.distance, after.episode)):
         assert np.isfinite(leaf).all()
-    # Its neighbours never know.
+    # The other arenas do not change.
     others = np.arange(ARENAS) != SPOILT
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[others], b[others]), after, sound[0])
     jax.tree.map(
@@ -325,7 +329,7 @@ def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
         trajectory,
         sound[1],
     )
-    # Whatever is learned from is finite.
+    # All samples that the learners use are finite.
     samples = rollout.batch(jax.tree.map(jnp.asarray, trajectory), program.config.algo)
     valid = np.asarray(samples.valid)
     for x in jax.tree.leaves(samples):
@@ -334,8 +338,8 @@ def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
 
 # --- the rollout against its replay
 
-# The scan is another program than the single step, which XLA fuses differently: float32's
-# rounding, which contacts multiply (6e-6 m in 100 steps at most was seen against the C engine).
+# XLA fuses the scan and the single step differently, so they differ by float32 rounding, which
+# contacts multiply. Against the C engine, the difference was at most 6e-6 m in 100 steps.
 DRIFT = 1e-5
 
 
@@ -344,11 +348,11 @@ def test_the_rollout_is_what_single_steps_make(run: Run, replay: Replay) -> None
     for name in ("terminated", "truncated", "valid"):
         np.testing.assert_array_equal(getattr(trajectory, name)[:, 0], getattr(came, name), name)
     np.testing.assert_allclose(trajectory.reward[:, 0], came.reward, atol=DRIFT)
-    # The parked stand on their targets, whose bearing is any.
+    # Parked robots stand on their targets, so the bearing of their target is arbitrary.
     present = replay.seen[..., DISTANCE] > 0.0
     np.testing.assert_allclose(
         trajectory.observation[:, 0][present], replay.seen[present], atol=20 * DRIFT
-    )  # 20: a bearing turns by 1 / 0.05 m as fast as its robot
+    )  # 20: at 0.05 m, a bearing turns by 1 / 0.05 rad for each metre that the robot moves
     assert came.terminated.any()
     assert came.truncated.any()
     np.testing.assert_allclose(run.after.sim.qpos, replay.last.sim.qpos, atol=DRIFT)
@@ -374,7 +378,7 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
     next_value = _values(tiny_config, run.learners, replay.came.observation)
     start = _values(tiny_config, run.learners, np.asarray(run.starts.observation))
     present = replay.seen[..., DISTANCE] > 0.0  # as above
-    # 1e-5: the drift of a bearing (2e-4) through a network whose slope is about 0.01 at first.
+    # 1e-5: a bearing drifts by 2e-4, and an untrained network has a slope of about 0.01.
     np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-5)
     np.testing.assert_allclose(found.next_value[:, 0][present], next_value[present], atol=1e-5)
     for t, arena in zip(*np.nonzero(replay.fresh[:-1]), strict=True):
@@ -382,7 +386,7 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
         found_next = found.value[t + 1, 0, arena]
         np.testing.assert_allclose(found_next, start[arena], atol=1e-6)  # float32
         assert np.abs(found.next_value[t, 0, arena] - found_next)[there].max() > 1e-4
-    # In the middle of an episode the two are one and the same.
+    # In the middle of an episode, the next value equals the value of the next step.
     going = ~replay.fresh[:-1]
     np.testing.assert_array_equal(found.next_value[:-1, 0][going], found.value[1:, 0][going])
 
@@ -395,7 +399,7 @@ def test_actions_are_drawn_from_the_policy(tiny_config: TrainConfig, run: Run) -
     assert abs(noise.mean()) < 0.26
     assert abs(noise.var() - 1.0) < 0.36
     density = -0.5 * noise**2 - np.log(0.6 * np.sqrt(2 * np.pi))
-    # 1e-4: float32, squares of up to 10.
+    # 1e-4: float32 rounding of squares of up to 10.
     np.testing.assert_allclose(run.trajectory.log_prob[:, 0], density.sum(axis=-1), atol=1e-4)
 
 
@@ -409,7 +413,8 @@ def test_a_broken_arena_starts_afresh_and_nothing_of_it_is_learnt(run: Run) -> N
 
 
 def test_a_level_counts_once_a_rollout(program: Program, run: Run) -> None:
-    # Episodes end at 16 control steps: those that run at once, those that wait after three more.
+    # Episodes end at 16 control steps: running episodes after one step, and waiting episodes after
+    # three more.
     before = dataclasses.replace(run.before, clock=jnp.full(ARENAS, 15, jnp.int32))
     starts = dataclasses.replace(run.starts, clock=jnp.full(ARENAS, 13, jnp.int32))
     collect = jax.jit(functools.partial(rollout.collect, program))
@@ -420,7 +425,7 @@ def test_a_level_counts_once_a_rollout(program: Program, run: Run) -> None:
     for arena in range(ARENAS):
         if arena not in (BROKEN, ARRIVES):
             assert ended.cohort[:, arena].tolist() == expected
-            assert ended.episodes[:, arena].tolist() == [1, 0, 0, 1, 0, 0, 1, 0]  # they train on
+            assert ended.episodes[:, arena].tolist() == [1, 0, 0, 1, 0, 0, 1, 0]  # still trained on
             assert after.cohort[arena] == uncounted
 
 
@@ -454,7 +459,7 @@ def test_episodes_that_wait_are_begun_in_turn_and_all_count(
             mine = turn * ARENAS + arena
             seen = trajectory.observation[first, 0, arena]
             np.testing.assert_array_equal(seen, starts.observation[mine])
-            # A matrix product of another width rounds differently, float32.
+            # float32: a matrix product of another width rounds differently.
             np.testing.assert_allclose(
                 trajectory.value[first, 0, arena], values[mine], rtol=1e-4, atol=1e-5
             )
@@ -463,7 +468,7 @@ def test_episodes_that_wait_are_begun_in_turn_and_all_count(
 
 
 def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object]]:
-    """What ended in which step of an arena, counted from the replay."""
+    """Returns the ended episodes of an arena by their last step, counted from the replay."""
     found, begin, clock, cohort, level = {}, 0, CLOCK[arena], NOW, _at(run.before.level, arena)
     for end in np.flatnonzero(replay.fresh[:, arena]):
         came = _at(replay.came, (slice(begin, end + 1), arena))
@@ -487,7 +492,7 @@ def _recount(run: Run, replay: Replay, arena: int) -> dict[int, dict[str, object
 
 
 def _contacts(level: Level, poses: np.ndarray) -> list[int]:
-    """Contacts of each kind of all robots of an arena on the way [T, R, 3] from its start."""
+    """Counts the contacts of each kind, of all robots of an arena, along their poses [T, R, 3]."""
     total, apart = np.zeros((ROBOTS, 3), int), np.full((ROBOTS, 3), gaps.CONTACT_PAUSE)
     for pose in poses:
         gap = gaps.gaps(pose, level.side, level.obstacle, HULL, np)
@@ -498,7 +503,7 @@ def _contacts(level: Level, poses: np.ndarray) -> list[int]:
 
 def test_ended_episodes_add_up(run: Run, replay: Replay) -> None:
     contacts = np.zeros(3, int)
-    for arena in set(range(ARENAS)) - {BROKEN}:  # whose poses are not finite
+    for arena in set(range(ARENAS)) - {BROKEN}:  # its poses are not finite
         expected = _recount(run, replay, arena)
         for t in range(T):
             ended = _at(run.ended, (t, arena))

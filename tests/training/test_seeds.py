@@ -1,4 +1,4 @@
-"""Seeds in one program: lanes that know nothing of each other, each of them a run."""
+"""Checks seeds in one program: each seed is a run that the other seeds do not affect."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,13 +58,13 @@ def run(side_by_side: Program) -> Run:
     ) -> tuple[TrainState, dict]:
         return seeds.train_chunk(side_by_side, schedule, state, jnp.asarray(n))
 
-    chex.clear_trace_counter()  # it knows functions by their address, and some are gone
+    chex.clear_trace_counter()  # it counts by a function's address, which may be reused
     traced_once = jax.jit(chex.assert_max_traces(chunk, n=1))
     return partial(traced_once, programs.schedule(side_by_side.config))
 
 
 def _lane(found: tuple[TrainState, dict], lane: int) -> Leaves:
-    """State and metrics of one seed, by name."""
+    """Returns the state and the metrics of one seed, by name."""
     state, metrics = found
     leaves = to_leaves(state) | {name: np.asarray(column) for name, column in metrics.items()}
     return {name: leaf[lane] for name, leaf in leaves.items()}
@@ -87,7 +87,7 @@ def test_every_seed_is_another_run(start: TrainState, run: Run) -> None:
 
 def test_neither_lane_nor_neighbours_matter(start: TrainState, run: Run) -> None:
     found = run(start, UPDATES)
-    order = np.array([2, 0, 0])  # other lanes, and another neighbour
+    order = np.array([2, 0, 0])  # other positions, and another neighbour
     moved = run(jax.tree.map(lambda x: x[order], start), UPDATES)
     for lane, seed in enumerate(order):
         _assert_same(_lane(moved, lane), _lane(found, seed))
@@ -137,8 +137,8 @@ def test_one_seed_is_what_the_loop_makes(
     chunk = jax.jit(partial(loop.train_chunk, program))
     expected, rows = chunk(schedule, plain, UPDATES)
     _assert_same(_lane((state, metrics), 0), to_leaves(expected) | jax.device_get(rows))
-    # Batched matrix products round differently from one seed's, in the last bits of float32
-    # (6e-8): after the two minibatches of four passes 1e-5 leaves room for what they grow to.
+    # Batched matrix products round differently from those of one seed, in the last bits of float32
+    # (6e-8). The difference grows over the gradient steps of the update; 1e-5 leaves room for it.
     once, _ = chunk(schedule, plain, np.int32(1))
     beside, _ = run(start, np.int32(1))
     for name, leaf in to_leaves(once.learners.params).items():
@@ -147,7 +147,7 @@ def test_one_seed_is_what_the_loop_makes(
 
 
 def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> None:
-    """At the end of a cohort whose verdict is made up: all, half and none of 10 targets."""
+    """Ends a cohort with made-up counts: the seeds reach all, half and none of 10 targets."""
     stages, cohort, threshold = 2, 2, 0.8
     reached = np.array([10, 5, 0], np.int32)
     counts = np.zeros((SEEDS, stages), np.int32)
@@ -158,7 +158,7 @@ def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> 
     before = replace(
         start.curriculum,
         cohort=np.full(SEEDS, cohort, np.int32),
-        age=np.full(SEEDS, 1, np.int32),  # of two updates: 16 control steps at 8 each
+        age=np.full(SEEDS, 1, np.int32),  # the second of two updates, of 8 steps each
         previous=previous,
     )
     state, metrics = run(replace(start, curriculum=before), UPDATES)
@@ -226,7 +226,7 @@ def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
 def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
     tiny_config: TrainConfig,
 ) -> None:
-    """A robot drives against a box, whose size is a number of the model, in each arena another."""
+    """Drives a robot against a box whose size, a number of the model, differs by arena."""
     lanes, arenas, steps = 3, 2, 40
     sim = replace(tiny_config.sim, impl="warp")
     engine = programs.load_world(replace(tiny_config, sim=sim, seeds=lanes, arenas=arenas)).physics
@@ -247,7 +247,7 @@ def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
 
     found = jax.jit(jax.vmap(jax.vmap(drive)))(obstacle.reshape(lanes, arenas, 2, 5))
     met = 0.1 - half - tiny_config.robot.hull_radius
-    # A robot that pushes sinks in by at most 4 mm (docs/design-notes.md, solver).
+    # A robot that pushes against a box sinks in by at most 4 mm (docs/design-notes.md, solver).
     np.testing.assert_allclose(np.ravel(found[:, :, 1, 1]), met, rtol=0.0, atol=4e-3)
     np.testing.assert_array_equal(found.reshape(-1, 3, 3), jax.jit(jax.vmap(drive))(obstacle))
 

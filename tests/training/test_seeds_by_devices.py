@@ -1,4 +1,4 @@
-"""Seeds spread over devices come to what each comes to alone."""
+"""Checks that seeds spread over devices train as on one device."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ TINY = [
 
 
 def _train(*words: str) -> None:
-    """Trains with two CPU devices to choose from."""
+    """Trains in a process that has two CPU devices."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
     subprocess.run(
         [sys.executable, "-m", "swarmjax.train", *words],
@@ -53,7 +53,7 @@ def _kernels(policy: Policy) -> list[np.ndarray]:
 @pytest.mark.slow
 def test_every_seed_is_the_one_that_it_is_alone(seed: int, folder: Path) -> None:
     spread, alone = (load(folder / name / f"policy-seed{seed}.npz") for name in ("spread", "alone"))
-    # Fused otherwise, so sums of float32 round otherwise.
+    # XLA fuses the two programs differently, so float32 sums round differently.
     for mine, its in zip(_kernels(spread), _kernels(alone), strict=True):
         np.testing.assert_allclose(mine, its, rtol=0.0, atol=1e-6)
 

@@ -1,7 +1,7 @@
-"""Trains a small run over devices, and writes what came of it.
+"""Trains a small run over devices, and writes its learners and metrics.
 
-`OUT DEVICES WORDS [COORDINATOR RANK]`: words of the config with spaces between them. With a
-coordinator it is one of two processes, which have a device each.
+The arguments are `OUT DEVICES WORDS [COORDINATOR RANK]`, where WORDS are words of the config with
+spaces between them. With a coordinator, this is one of two processes with one device each.
 """
 
 import re
@@ -16,7 +16,7 @@ from swarmjax.run.settings import load_train
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
-# Episodes of two updates: cohorts are judged, and stages change, within twenty.
+# An episode takes two updates, so cohorts are judged and stages change within twenty updates.
 WORDS = [
     "arenas=64",
     "budget=40960",

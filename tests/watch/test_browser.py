@@ -1,4 +1,4 @@
-"""The page of a run in a browser: Chromium without a window, from the loopback alone."""
+"""Tests the page of a run in headless Chromium, served only on the loopback interface."""
 
 import json
 import threading
@@ -26,7 +26,7 @@ TRAINED = replace(CONFIG, seeds=2, run=RunConfig(id="0123456789abcdef"))
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
-    """What is shown of a run of two seeds that was killed, whose directory has an evil name."""
+    """Returns the views of a killed run of two seeds, whose directory's name is an HTML tag."""
     rows = [row(update, seed) for update in range(TRAINED.updates - 1) for seed in (0, 1)]
     run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
     _, _, state = lifecycle.begin(TRAINED)
@@ -67,9 +67,9 @@ def test_a_policy_is_replayed_once(views: Views) -> None:
 
 @chromium.needed
 def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Server) -> None:
-    browser.get("about:blank")  # the browser's own first page asks for much
+    browser.get("about:blank")  # the browser's own start page makes many requests
     for log in ("performance", "browser"):
-        browser.get_log(log)  # reading empties it
+        browser.get_log(log)  # reading a log empties it
     browser.get(server.url)
     wait = WebDriverWait(browser, 60)
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
@@ -81,7 +81,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     browser.switch_to.frame("replay")
     wait.until(lambda _: browser.execute_script("return !!window.replay?.ready"))
     browser.switch_to.default_content()
-    # The name of the run is text.
+    # The page shows the run's name as text, not as HTML.
     assert browser.title == f"Watching {server.views.run}"
     assert browser.find_element("css selector", "h1").text.endswith(HOSTILE)
     seen = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
@@ -91,9 +91,9 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
         if each["method"] == "Network.requestWillBeSent"
     }
     paths = {url.removeprefix(server.url) for url in asked if url.startswith(server.url)}
-    assert len(paths) == len(asked - {"data:,"})  # the icon is empty, and inside the page
+    assert len(paths) == len(asked - {"data:,"})  # the icon is an empty data URL
     assert {"", "state.json", "figures/targets.png?1", "replay.html?1"} <= paths
-    assert browser.get_log("browser") == []  # no errors, and nothing that the page forbids itself
+    assert browser.get_log("browser") == []  # no errors, no breach of the security policy
 
 
 @chromium.needed

@@ -1,4 +1,4 @@
-"""What the server of a run's page answers, and what it says of a run."""
+"""Tests the answers of the server of a run's page, and what it reports about the run."""
 
 import http.client
 import json
@@ -35,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(run: Path) -> Iterator[Server]:
-    """A server whose figures are drawn, and that renews nothing."""
+    """Yields a server whose figures are drawn once and never renewed."""
     views = Views(WatchConfig(run=str(run)))
     views.draw()
     with Server(0, views) as made:
@@ -47,7 +47,7 @@ def server(run: Path) -> Iterator[Server]:
 def _ask(
     server: Server, path: str, method: str = "GET", host: str | None = None
 ) -> tuple[int, dict[str, str], bytes]:
-    """Asks, with any words as path and host."""
+    """Sends a request with any text as path and host; returns status, headers and content."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=30)
     connection.putrequest(method, path, skip_host=True)
     if host != "":
@@ -92,8 +92,8 @@ def test_what_there_is_is_answered_and_not_kept(server: Server, path: str, kind:
         "/%2e%2e/config.json",
         "//etc/passwd",
         "/figures/../../../../etc/passwd.png",
-        "/figures/curves.png",  # which these rows do not make
-        "/replay.html",  # not yet
+        "/figures/curves.png",  # a figure that these rows do not produce
+        "/replay.html",  # no replay is made yet
         "http://127.0.0.1/",
         "*",
     ],
@@ -182,7 +182,7 @@ def test_a_run_whose_lock_is_held_trains(tmp_path: Path) -> None:
     with directory.locked(run):
         state, sentence = _state(run)
     assert state == "trains"
-    # 60 s of training for 2 updates, and 18 are left.
+    # Two updates took 60 s of training, and 18 updates are left.
     assert "It trains: 2 of 20 updates done, about 9 min 00 s left; the newest" in sentence
 
 
@@ -206,7 +206,7 @@ def test_a_run_whose_process_was_killed_says_so(tmp_path: Path) -> None:
         holder.kill()
     state, sentence = _state(run)
     assert state == "killed"
-    assert sentence.startswith("It was killed, or broke, after 1 of 20 updates; the newest was")
+    assert sentence.startswith("It was killed, or broke, after 1 of 20 updates; the newest update")
     assert sentence.endswith(f"Go on with: python -m swarmjax.train resume={run}")
 
 
@@ -214,7 +214,7 @@ def test_the_number_of_a_dead_process_that_another_has_by_now_is_not_it(tmp_path
     run = write(tmp_path / "run", [row(0)])
     with directory.locked(run):
         pass
-    (run / ".lock").write_text(f"process {os.getpid()}\n")  # which holds no lock
+    (run / ".lock").write_text(f"process {os.getpid()}\n")  # this process holds no lock
     assert _state(run)[0] == "killed"
 
 
@@ -267,7 +267,7 @@ def test_without_a_list_of_locks_a_process_is_asked_for(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(Path, "read_text", missing)
     assert directory.is_writing(Writer(os.getpid(), ""))
-    assert not directory.is_writing(Writer(2**22 + 1, ""))  # above the largest number of Linux
+    assert not directory.is_writing(Writer(2**22 + 1, ""))  # above Linux's largest process number
 
 
 # The newest policy

@@ -1,4 +1,4 @@
-"""Gradients by blocks are those of the whole batch."""
+"""Checks that gradients computed in blocks equal the gradient of the whole batch."""
 
 import chex
 import jax
@@ -13,15 +13,15 @@ from swarmjax.ppo.fast import blocks
 from swarmjax.ppo.losses import Minibatch
 
 CONFIG = AlgoConfig(hidden_sizes=(8,), num_minibatches=1, epochs=3, entropy_cost=0.01)
-GROUPS, SAMPLES = 3, 250  # 750 samples: two blocks and a part of one
+GROUPS, SAMPLES = 3, 250  # 750 samples fill two blocks of 256 and part of a third
 OBSERVATION, ACTION = 10, 2
 
 
 def _batch(share: float, seed: int = 0) -> Minibatch:
-    """Samples [G, N, ...] of which about this share is valid, zero where not."""
+    """Returns samples [G, N, ...] of which about this share is valid; the others are 0."""
     rng = np.random.default_rng(seed)
     valid = rng.uniform(size=(GROUPS, SAMPLES)) < share
-    valid[0, 0] |= share > 0.0  # what fills gaps up must not count again
+    valid[0, 0] |= share > 0.0  # copies of this sample fill the blocks and must not count
     drawn = {
         "observation": rng.normal(size=(GROUPS, SAMPLES, OBSERVATION)),
         "action": rng.normal(size=(GROUPS, SAMPLES, ACTION)),
@@ -42,12 +42,12 @@ def _params() -> networks.Params:
 def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) -> None:
     samples, params = _batch(share), _params()
     arranged = blocks.arrange(samples)
-    assert int(arranged.used) == used  # of 750, about 375, 75 and 0 samples in blocks of 256
+    assert int(arranged.used) == used  # 750, about 375, about 75 and 0 samples, in blocks of 256
     count = jnp.sum(samples.valid)
     found = blocks.gradient(params, arranged, CONFIG, count)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     whole = jax.grad(losses.ppo_loss, has_aux=True)
-    # Sums of float32 in another order.
+    # float32 rounding: the two gradients add the samples in different orders.
     for mine, theirs in zip(
         jax.tree.leaves(found), jax.tree.leaves(whole(params, flat, CONFIG, count)), strict=True
     ):
@@ -72,7 +72,7 @@ def test_a_learner_learns_as_by_autodiff() -> None:
     found, told = update(begun, CONFIG, batch, jax.random.key(1), 5, "blocks")
     expected, metrics = update(begun, CONFIG, batch, jax.random.key(1), 5, "autodiff")
     chex.assert_trees_all_equal_structs((found, told), (expected, metrics))
-    # Steps of Adam along gradients that differ by rounding.
+    # The gradients differ by rounding, and so do Adam's steps.
     chex.assert_trees_all_close((found, told), (expected, metrics), rtol=1e-4, atol=1e-5)
     moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), found.params, begun.params)
     assert max(jax.tree.leaves(moved)) > 1e-3
@@ -93,7 +93,7 @@ def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
         mine = jax.tree.map(lambda x, i=lane: x[i], learners)
         alone = jax.jit(update)(mine, batch, keys[lane]).params
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-            # What is normalised before, and Adam's steps, are vectorised.
+            # float32 rounding: the normalisation and Adam's steps are vectorised over learners.
             np.testing.assert_allclose(a[lane], b, atol=1e-6)
     before = jax.tree.leaves(jax.tree.map(lambda x: x[2], learners.params))
     after = jax.tree.leaves(jax.tree.map(lambda x: x[2], together))

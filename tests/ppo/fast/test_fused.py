@@ -1,4 +1,4 @@
-"""The kernel's gradient is that of the loss; interpreted here, since no GPU is asked for."""
+"""Checks that the kernels compute the gradient of the loss, in interpret mode without a GPU."""
 
 import functools
 from dataclasses import replace
@@ -25,13 +25,14 @@ from swarmjax.ppo.networks import Params
 
 OBSERVATION, ACTION = 10, 2
 SMALL = AlgoConfig(hidden_sizes=(16,), entropy_cost=0.02, value_cost=0.7)
-# Sums of float32 in another order, and exp(-log_std) for 1 / std: what is found is about 2e-6.
+# The kernels sum float32 terms in another order and use exp(-log_std) for 1 / std. The measured
+# relative error is about 2e-6.
 RELATIVE = 2e-5
 H100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platform="gpu")
 
 
 def _params(config: AlgoConfig, seed: int = 0) -> Params:
-    """Parameters none of which is 0; mean actions lie within -1..1 and beyond."""
+    """Returns parameters without zeros; their mean actions lie inside and outside -1..1."""
     shapes = jax.eval_shape(
         lambda: networks.init_params(jax.random.key(0), config, OBSERVATION, ACTION)
     )
@@ -50,7 +51,7 @@ def _log_prob(
 
 
 def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> Minibatch:
-    """Samples of which about a third is invalid, and about half have a clipped ratio."""
+    """Returns samples; about a third are invalid, and about half have a clipped ratio."""
     random = np.random.default_rng(seed)
     observation = random.normal(size=(size, OBSERVATION)).astype(np.float32)
     action = random.normal(size=(size, ACTION)).astype(np.float32)
@@ -66,7 +67,7 @@ def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> 
 
 
 def _expected(params: Params, minibatch: Minibatch, config: AlgoConfig, count: float) -> Any:
-    """Autodiff's gradient and metrics."""
+    """Returns the gradient and the metrics of autodiff."""
     with jax.default_matmul_precision("highest"):
         gradient = jax.grad(losses.ppo_loss, has_aux=True)
         return jax.jit(gradient, static_argnums=2)(params, minibatch, config, jnp.float32(count))
@@ -92,13 +93,14 @@ def _assert_close(found: Any, expected: Any) -> None:
 @pytest.mark.parametrize(
     ("changes", "launch", "size", "count"),
     [
-        # Seven tiles, the last of 8 samples, for three programs: two find nothing in the end.
+        # Seven tiles for three programs: two programs have no tile left in the last round. The
+        # last tile holds 8 samples.
         ({"hidden_sizes": (64, 64)}, Launch(32, 3, 4), 200, 140.0),
         ({"hidden_sizes": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
         ({"hidden_sizes": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
         ({"exploration": "scheduled"}, Launch(64, 1, 4), 65, 40.0),
         ({"mean_activation": "tanh"}, Launch(32, 2, 4), 40, 30.0),
-        # With 0.25 expected, the sums are divided by 1.
+        # With 0.25 expected valid samples, the sums are divided by 1.
         ({"clip_epsilon": 0.3}, Launch(32, 2, 4), 9, 0.25),
     ],
 )
@@ -125,7 +127,7 @@ def test_float_masks_count_as_boolean_ones() -> None:
 def test_without_a_valid_sample_all_is_zero() -> None:
     params = _params(SMALL)
     minibatch = _minibatch(params, SMALL, 40)
-    # A log ratio of about 1000: masked only after exp, its gradient would be NaN.
+    # The log ratio is about 1000: if it were masked only after exp, its gradient would be NaN.
     minibatch = replace(
         minibatch, valid=np.zeros(40, bool), log_prob=minibatch.log_prob - np.float32(1000.0)
     )
@@ -134,7 +136,7 @@ def test_without_a_valid_sample_all_is_zero() -> None:
 
 
 def _several(*lead: int) -> tuple[Params, Minibatch, jax.Array]:
-    """Parameters, samples and expected counts, each with these leading axes."""
+    """Returns parameters, samples and expected counts, each with these leading axes."""
     number = int(np.prod(lead))
     params = [_params(SMALL, seed) for seed in range(number)]
     batches = [_minibatch(p, SMALL, 40, seed) for seed, p in enumerate(params)]
@@ -158,7 +160,7 @@ def test_learners_and_seeds_side_by_side_come_to_what_each_does_alone(lead: tupl
 
 
 def _lowered(function: Any, *arguments: Any) -> str:
-    """What a GPU would be given."""
+    """Returns the text of the program that JAX lowers for a GPU."""
     with jax.sharding.use_abstract_mesh(AbstractMesh((), (), abstract_device=H100)):
         traced = jax.jit(function).trace(*arguments)
         return traced.lower(lowering_platforms=("cuda",)).as_text()
@@ -176,7 +178,7 @@ def test_triton_knows_all_that_the_kernels_do(activation: Any, launch: Launch, t
         params,
         minibatch,
     )
-    # 1,000 samples in tiles of 64 or 128, for actor and critic each.
+    # The actor's kernel and the critic's kernel each take 1,000 samples in tiles of 64 or 128.
     assert text.count("__gpu$xla.gpu.triton") == 2
     assert text.count(f"grid_x = {tiles} : i32") == 2
 
@@ -200,7 +202,7 @@ def test_products_have_the_precision_that_jax_is_set_to(
                 params, minibatch
             )
         )
-    # Forward two and back three products, of actor and critic each.
+    # Actor and critic each compute two matrix products forward and three backward.
     assert jaxpr.count("dot_general[") == 10
     assert jaxpr.count("Precision.HIGHEST, Precision.HIGHEST") == (10 if of_all else 0)
 
@@ -217,14 +219,14 @@ def _batch(drawn: Minibatch, groups: int) -> ppo.Batch:
 def _learn(
     config: AlgoConfig, begun: ppo.LearnerState, batch: ppo.Batch, backend: Backend = "fused"
 ) -> Any:
-    """Parameters, the optimiser's state and metrics of an update."""
+    """Returns the parameters, the optimiser's state and the metrics after one update."""
     update = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5, backend))
     made, metrics = update(batch)
     return made.params, made.optimizer_state, metrics
 
 
 def _interpret(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Has the kernels interpreted; lists each time that they are traced."""
+    """Runs the kernels in interpret mode; returns a list that grows with each trace of them."""
     calls, real = [], fused.flat_gradient
 
     def interpreted(*arguments: Any, launch: Launch) -> Any:
@@ -236,7 +238,7 @@ def _interpret(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def _assert_learned_alike(found: Any, expected: Any) -> None:
-    """Holds steps of Adam along gradients that differ by rounding to each other."""
+    """Checks that two results of Adam agree, up to the rounding of their gradients."""
     chex.assert_trees_all_equal_structs(found, expected)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), found, expected
@@ -252,7 +254,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     expected = _learn(config, begun, batch, "autodiff")
     calls = _interpret(monkeypatch)
     _assert_learned_alike(_learn(config, begun, batch), expected)
-    assert len(calls) == 1  # traced once, in a loop over steps
+    assert len(calls) == 1  # traced once, inside a loop over the steps
 
 
 def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
@@ -264,12 +266,12 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     _interpret(monkeypatch)
     found = _learn(config, begun, _batch(drawn, 32))
 
-    # By hand: about 900 valid samples, normalised, in tiles of 64.
+    # Computes the same by hand: about 900 valid samples, normalised, in tiles of 64.
     valid = jax.tree.map(lambda x: x[np.asarray(drawn.valid)], drawn)
     mean, std = np.mean(valid.advantage), np.std(valid.advantage)
     valid = replace(valid, advantage=(valid.advantage - mean) / (std + 1e-8))
     count = len(valid.valid)
-    # A new learner's moments are 0 and 1, which leave observations as they are but for 1e-8.
+    # A new learner's moments are 0 and 1, which leave observations unchanged.
     keys = jax.random.split(jax.random.key(1), config.epochs)
     tiles = fused.shuffle(keys, 1280, jnp.int32(count), 4, fused.LAUNCH)
     progress, told = (begun.params, begun.optimizer_state), []
@@ -337,7 +339,7 @@ def test_tiles_with_valid_samples_are_dealt_out_once_a_pass(
         assert sorted(np.concatenate(one_pass).tolist()) == list(range(used))
         sizes = [len(part) for part in one_pass]
         assert max(sizes) - min(sizes) <= 1
-    if used > 20:  # by chance once in 20!
+    if used > 20:  # two random orders are equal with a chance below 1 / 20!
         assert np.any(np.concatenate(dealt[0]) != np.concatenate(dealt[1]))
 
 
@@ -348,7 +350,7 @@ def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
         "grad_norm",
         "taken_steps",
         "skipped_steps",
-    )  # what `optimizer.take` adds to the loss's own
+    )  # metrics that `optimizer.take` adds to the metrics of the loss
     assert sorted(expected) == [name for name in optimizer.METRICS if name not in of_the_step]
 
 
@@ -372,7 +374,7 @@ def test_a_layout_finds_each_parameter_in_the_vector(name: str) -> None:
     ("hidden", "possible"),
     [
         ((64, 64), True),
-        # 4 * (16 * 128 + 2 * 128 * 16 + 64 * (16 + 2 * 128)) = 94,208 bytes, of 97,280.
+        # 4 * (16 * 128 + 2 * 128 * 16 + 64 * (16 + 2 * 128)) = 94,208 of the chip's 97,280 bytes.
         ((128,), True),
         # 4 * (16 * 64 + 2 * (2 * 64 * 64 + 64 * 16) + 64 * (16 + 2 * 64)) = 114,688 bytes.
         ((64, 64, 64), False),
@@ -407,6 +409,7 @@ def _on(monkeypatch: pytest.MonkeyPatch, **device: str) -> None:
 @pytest.mark.parametrize(
     ("capability", "hidden", "expected"),
     [
+        # Tiles of 128 samples need
         # 4 B * (16 * 64 + 2 * (64 * 64 + 64 * 16) + 128 * (16 + 2 * 64)) = 116 KiB.
         ("9.0", (64, 64), fused.LARGE),
         ("8.0", (64, 64), fused.LARGE),
@@ -427,5 +430,5 @@ def test_a_small_batch_has_small_tiles(
     samples: int, expected: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _on(monkeypatch, compute_capability="9.0")
-    config = AlgoConfig(num_minibatches=8)  # 8 tiles of 128 a minibatch are 8,192 samples
+    config = AlgoConfig(num_minibatches=8)  # 8 minibatches of 8 tiles of 128 are 8,192 samples
     assert fused.choose_launch(config, OBSERVATION, ACTION, samples) == expected

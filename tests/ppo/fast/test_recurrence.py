@@ -1,4 +1,4 @@
-"""The kernels of a memory, run as ordinary JAX: what XLA makes of a unit, and its gradient."""
+"""Checks the memory kernels, run as ordinary JAX, against XLA's results and gradients of a GRU."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -16,9 +16,10 @@ from swarmjax.ppo.memory import Gru
 
 STEPS, WIDTH, SIZE = 5, 7, 16
 ROWS = 2 * recurrence.TILE + 3  # the last tile is not full
-# float32 sums of 16 to 67 products of about 1.
+# Rounding of float32 sums of 16 to 67 products of about 1.
 ROUND = 2e-6
-# What is seen is rounded to 8 bits twice, and its slopes lie below 1.
+# The GRU's input is rounded to the 8 bits of bfloat16 twice, and the slopes of the output with
+# respect to it lie below 1.
 BFLOAT16 = 2.0**-6
 
 
@@ -96,7 +97,7 @@ def test_a_network_may_use_them_for_one_step(axes: tuple[int, ...]) -> None:
 
 
 def test_a_step_is_the_first_of_a_sequence() -> None:
-    """The ratio of a sample's probabilities is 1 before anything is learned."""
+    """Compares all bits, so that the probability ratio of a sample is 1 before any learning."""
     _, fast, params = _units()
     features, before = _drawn(1, ROWS, WIDTH, seed=7), jnp.tanh(_drawn(ROWS, SIZE, seed=9))
     whole = fast.apply(params, features, before, jnp.zeros((1, ROWS), bool))[0]
@@ -112,7 +113,7 @@ def test_learners_have_kernels_of_their_own() -> None:
 
 
 class TestWhereTheyAreUsed:
-    """`dispatch.bind_memory`."""
+    """Tests of `dispatch.bind_memory`."""
 
     CONFIG = AlgoConfig(memory="gru", memory_size=32)
 

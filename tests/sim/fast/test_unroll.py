@@ -1,4 +1,4 @@
-"""Things taken one after the other come to the same as all at once."""
+"""Tests that taking things one by one gives the same result as taking all at once."""
 
 import functools
 from types import ModuleType
@@ -29,7 +29,7 @@ def test_many_things_none_and_numpy_are_one_piece(count: int, xp: ModuleType) ->
 @MODULES
 @pytest.mark.parametrize("count", [2, MOST + 1])
 def test_the_last_of_few_and_of_many_robots_and_boxes_is_met(xp: ModuleType, count: int) -> None:
-    """Robot 0 at the origin faces the last box and has the last robot on its left."""
+    """Puts robot 0 at the origin, with the last box ahead of it and the last robot on its left."""
     pose = np.array([[0.0, -2.0 - 0.2 * i, 0.0] for i in range(count)], np.float32)
     pose[0], pose[-1] = 0.0, [0.0, 0.1, 0.0]
     box = np.array([[-2.0 - 0.2 * i, 0.0, 0.0, 0.05, 0.05] for i in range(count)], np.float32)
@@ -40,10 +40,10 @@ def test_the_last_of_few_and_of_many_robots_and_boxes_is_met(xp: ModuleType, cou
         look, measure = jax.jit(look), jax.jit(measure)
     pose, side, box = xp.asarray(pose), np.float32(20.0), xp.asarray(box)
     seen, gap = look(pose, side, box), measure(pose, side, box)
-    # 1e-6 m: some roundings of float32. Walls are 10 m off.
+    # 1e-6 m covers several roundings of float32. The walls are 10 m away.
     np.testing.assert_allclose(gap[0], [0.1 - 2 * RADIUS, 0.05 - RADIUS, 10 - RADIUS], atol=1e-6)
-    # Sensor 5 looks left, from 0.031 m off the centre; sensor 0, 0.030 m before it and turned by
-    # 0.30081 rad, at the face of the box.
+    # Sensor 5 sits 0.031 m beside the centre and looks left. Sensor 0 sits 0.030 m ahead of the
+    # centre and looks at the face of the box, turned by 0.30081 rad.
     assert seen[0, 5] == pytest.approx(0.1 - RADIUS - 0.031, abs=1e-6)
     assert seen[0, 0] == pytest.approx((0.05 - 0.030) / np.cos(0.30081), abs=1e-6)
-    assert seen[0, 2] == np.float32(RANGE)  # to the right is nothing
+    assert seen[0, 2] == np.float32(RANGE)  # nothing is to the right

@@ -1,4 +1,4 @@
-/* See policy.h. Of the mathematical library this needs tanhf alone$tanh. */
+/* See policy.h. From the mathematical library this file needs only tanhf$tanh. */
 #include "policy.h"
 
 #include <math.h>
