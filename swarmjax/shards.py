@@ -24,8 +24,8 @@ class Shards:
 
     Attributes:
       devices: D, the number of devices that share the arenas. With 1 there is no mesh.
-      streams: S, the number of random streams, a multiple of D. Stream i serves the arenas from
-        i A / S on.
+      streams: S, the number of random streams, a multiple of D. Stream i serves A / S of
+        the A arenas; the first of them is arena i A / S.
     """
 
     devices: int = 1

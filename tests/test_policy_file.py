@@ -622,8 +622,8 @@ def test_of_1400_damaged_files_each_is_refused_or_reads_as_before(tmp_path: Path
     assert not mark.exists()  # nothing was unpickled
     never = {"_truncated", "_pickled", "_foreign", "_repeated"}
     assert all(same[name] == 0 for name in never)
-    # Most bytes are covered by a checksum or belong to a name. A few bytes, such as those of times,
-    # are neither.
+    # Most bytes are covered by a checksum or belong to a name. A few bytes, such as the
+    # file's times, are not protected.
     assert 0 < same["_flipped"] < 0.2 * _EACH
 
 

@@ -43,8 +43,8 @@ _MOST_LEVELS = 2**20
 class LevelsConfig(Section):
     """Which levels of a stage are trained on.
 
-    Modes without a buffer require null for the options of a buffer. In modes with one, null means
-    the default.
+    In a mode without a buffer, the options of a buffer must be null. In a mode with a buffer, null
+    means the default.
     """
 
     mode: Literal["random", "learnability", "value_loss"] = field(

@@ -136,8 +136,8 @@ def test_a_plan_exchanges_a_circle() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"crowd", "circle"}))
-def test_ten_thousand_levels_can_be_solved(name: str) -> None:
-    for drawn in _levels(name, 10_000):
+def test_a_thousand_levels_can_be_solved(name: str) -> None:
+    for drawn in _levels(name, 1000):
         moves = plan.find(drawn, HULL, REACH)
         assert moves is not None
         assert plan.check(drawn, moves, HULL, REACH) is None

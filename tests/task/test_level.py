@@ -263,8 +263,8 @@ def test_levels_fill_the_arena(stage: StageConfig, drawn: Level) -> None:
         counts = np.bincount(quadrant, minlength=4)
         # A fair sampler fails at a given seed with probability 1e-5.
         assert stats.chisquare(counts).pvalue > 1e-5, counts
-        # A robot's centre comes as near to any wall as the hull and 2 cm, rounded up. The rim that
-        # is left over is less than one step of the lattice.
+        # The centre of a robot keeps a distance of the hull's radius plus 2 cm, rounded up, from
+        # every wall. What remains is less than one step of the lattice.
         rim = 0.5 * stage.sides[0] - HULL - MARGIN - np.array([place.max(), -place.min()])
         assert (rim < stage.sides[0] / LATTICE + 1 / UNITS).all()
         # Every ninth of the arena is used. The middle ninth has the fewest robots, because the
