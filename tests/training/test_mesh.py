@@ -59,7 +59,7 @@ def alone(words: str, tmp_path_factory: pytest.TempPathFactory) -> Found:
 
 
 @pytest.fixture(
-    scope="module", params=[pytest.param("one process", marks=pytest.mark.slow), "two processes"]
+    scope="module", params=["one process", pytest.param("two processes", marks=pytest.mark.slow)]
 )
 def spread(
     request: pytest.FixtureRequest, words: str, tmp_path_factory: pytest.TempPathFactory
