@@ -399,7 +399,7 @@ def test_a_level_replays_exactly(engines: Engines) -> None:
 # --- one factor at a time
 
 # Two robots push each other, one stands beside the east wall, and one stands before an obstacle.
-# All drive in a gentle curve to the left, whatever they observe.
+# All robots ignore their observations and drive in a gentle curve to the left.
 CROWD = [[-0.038, 0.0, 0.0], [0.038, 0.0, 3.0], [0.45, 0.0, 1.0], [0.0, -0.3, 0.0]]
 BOX = [[0.11, -0.3, 0.0, 0.05, 0.05]]
 CURVE = ((0.4, 0.2), (0.0, 0.0), (0.0, 0.0))

@@ -248,7 +248,7 @@ def test_absent_robots_take_no_part(episode: Episode) -> None:
         assert not getattr(episode.came, name)[:, absent].any(), name
     for total in episode.state.episode:
         assert not total[-1][absent].any()
-    # Absent robots stay where they are parked, whatever their action.
+    # Actions do not move absent robots from where they are parked.
     np.testing.assert_array_equal(
         episode.pose[:, absent], np.broadcast_to(episode.pose[0][absent], (LIMIT + 1, 5, 3))
     )
