@@ -170,8 +170,8 @@ def test_leaving_and_coming_back_earns_nothing(way: list[float]) -> None:
         for before, now in itertools.pairwise(path)
     )
     outside = sum(distance > 0.05 for distance in path)
-    # A step outside costs 0.002, and 0.001 for what is in range. 1e-6 covers 21 differences in
-    # float32.
+    # A step outside the target costs 0.002, and 0.001 more because something is in range. 1e-6
+    # covers 21 differences in float32.
     assert total == pytest.approx(-0.003 * outside, abs=1e-6)
 
 
