@@ -24,8 +24,8 @@ from swarmjax import epuck, provenance
 from swarmjax.config import about
 
 # JaxNav's cells are 1 m wide and its robots have a radius of 0.3 m, so our lengths are scaled by
-# 0.3 / 0.037. Our rays of 0.04 m correspond to 0.32 m here. The samples along a ray have JaxNav's
-# default spacing of 0.05 m.
+# 0.3 / 0.037. Our rays of 0.04 m would be 0.32 m long here. They are 0.3 m long, because samples
+# along a ray have JaxNav's default spacing of 0.05 m.
 RADIUS = 0.3
 BEAMS, RANGE, RESOLUTION = 8, 0.3, 0.05
 CELLS = 7  # cells per side; the outer cells are walls

@@ -29,6 +29,7 @@ NAMES = {
     "contacts": "Contacts per robot of each stage, its newest verdict, over arena control steps",
     "return": "Return per robot of each stage, its newest verdict, over arena control steps",
     "mix": "On which stages the arenas were, over arena control steps",
+    "levels": "The levels kept for replay: how many, their share of episodes, success and score",
 }
 
 
@@ -167,4 +168,7 @@ def figures(history: History) -> dict[str, bytes]:
     made = report_figures.by_stage(history)
     if len(history.names) > 1:
         made["mix"] = report_figures.mix(history, report_figures.SMALL)
+    levels = report_figures.levels(history)
+    if levels is not None:
+        made["levels"] = levels
     return {name: drawing.png(figure) for name, figure in made.items()}

@@ -94,13 +94,14 @@ def test_the_stages_are_fixed_levels_that_hold_their_robots() -> None:
 
 def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
     mine = drive.from_config(PAPER.robot)
-    # The realised (v, w), in m/s and rad/s, are from epuck_facts.md section 1.7. The first three
-    # actions command (0.25, 3.14), (0.0625, 3.14) and (0, 3.14). With the first, both wheels reach
-    # their limit of 6.28 rad/s. In the second, 0.0625 m/s is 6.25 / 2 rad/s at each wheel.
+    # The realised (v, w), in m/s and rad/s, were worked out by hand for wheels of 0.02 m on a track
+    # of 0.052 m: a wheel turns at (v -/+ 0.026 w) / 0.02, at most 6.28 rad/s. The actions command
+    # (0.25, 3.14), (0.0625, 3.14), (0, 3.14) and (0.25, 1.57). In the second, the wheels would
+    # turn at -0.957 and 7.207 rad/s. So v = 0.01 (6.28 - 0.957) and w = (6.28 + 0.957) / 2.6.
     action = np.array([[1.0, 1.0], [-0.5, 1.0], [-1.0, 1.0], [1.0, 0.5]])
     wheels = drive.wheel_speeds(drive.command(action, mine, np), mine, np)
     found = drive.body_velocity(wheels, mine.wheel_radius, mine.track, np)
-    # The tolerance covers the digits that the table rounds off.
+    # The tolerance covers the digits that are rounded off here.
     np.testing.assert_allclose(
         found, [[0.1256, 0.0], [0.053, 2.78], [0.0, 3.14], [0.1256, 0.0]], atol=6e-3
     )

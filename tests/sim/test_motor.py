@@ -252,7 +252,7 @@ def test_numpy_with_leading_axes_and_mapped_jax_disturb_alike(
     ("version", "asked", "made"),
     [
         # Version 1 makes 10000 / int(10000 / s) steps per second. A step here takes 10, 11, 12 or
-        # 16 ticks of 0.1 ms (facts, section 4.1).
+        # 16 ticks of 0.1 ms (`e_motors.c` of e-puck-library).
         ("epuck1", 1000, 1000.0),
         ("epuck1", 950, 1000.0),
         ("epuck1", 900, 909.0909),
