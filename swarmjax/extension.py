@@ -78,7 +78,10 @@ class Observation(Piece):
     """
 
     kind: ClassVar[str] = "observation"
-    taken: ClassVar[tuple[str, ...]] = ("infrared", "target_distance", "target_bearing")
+    taken: ClassVar[tuple[str, ...]] = (
+        *("infrared", "target_distance"),
+        *("target_bearing", "target_bearing_cos", "target_bearing_sin"),
+    )
 
     size: int
     unit: str

@@ -319,7 +319,7 @@ def _read_infrared(
         ray = sight.ray
         if factors.dead is not None:
             ray = xp.where(factors.dead, electronics.reach, ray)
-        if encoding == "metric":
+        if encoding != "webots":
             return xp.minimum(ray, electronics.sensor_range)
         return response.expected("webots", ray, xp)
     wear = response.Wear(
@@ -334,7 +334,7 @@ def _read_infrared(
         return counts
     # A calibrated robot converts counts back to a distance.
     ray = response.distance(kind, counts, xp)
-    if encoding == "metric":
+    if encoding != "webots":
         return xp.minimum(ray, electronics.sensor_range)
     return response.expected("webots", ray, xp)
 
