@@ -1,0 +1,101 @@
+"""How is the time of an update divided among drawing levels, the rollout and learning?
+
+`python -m benchmarks.update_parts [key=value ...]` takes the keys of `swarmjax.train`. It compiles
+each part of an update as a program of its own, with all stages of the config and untrained
+networks. It prints a JSON line for each part. Together the parts take about as long as an update,
+but not exactly, because XLA optimises each program as a whole. Unlike `benchmarks.profile`, it
+keeps all stages, so it also shows what drawing the levels of different layouts costs.
+"""
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+from jax import Array
+
+from benchmarks import steps_per_second, timing
+from swarmjax import command
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.training import loop, rollout
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+from swarmjax.training.rollout import Arena
+
+
+def draw(program: Program, schedule: Schedule, state: TrainState, key: Array) -> Arena:
+    """Draws the levels on which arenas start when an episode ends during a rollout."""
+    return loop._draw_waiting(program, schedule, state.curriculum, key)
+
+
+def collect(program: Program, state: TrainState, waiting: Arena, key: Array) -> Batch:
+    """Lets all arenas drive for a rollout, and computes advantages."""
+    _, trajectory, _ = rollout.collect(program, state.learners, state.arenas, waiting, key)
+    return rollout.batch(trajectory, program.config.algo, program.shards, state.arenas.recall)
+
+
+def learn(program: Program, state: TrainState, batch: Batch, key: Array) -> LearnerState:
+    """Updates all learners."""
+    config = program.config
+    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
+    return jax.vmap(
+        lambda learner, samples, each: ppo.update(
+            learner, config.algo, samples, each, config.updates, program.backend, program.shards
+        )[0]
+    )(explored, batch, jax.random.split(key, config.learners))
+
+
+def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
+    """Times each part of an update; yields a line for each."""
+    program, schedule = programs.load(settings)
+    state = jax.jit(partial(loop.init, program))(schedule)
+    key = jax.random.key(settings.seed)
+    about = {
+        "arenas": settings.arenas,
+        "stages": len(settings.stage),
+        "rollout_length": settings.algo.rollout_length,
+        "waiting": settings.waiting,
+        **steps_per_second.made_with(),
+    }
+    line, waiting = _timed("draw", partial(draw, program), (schedule, state, key))
+    yield line | about
+    line, batch = _timed("collect", partial(collect, program), (state, waiting, key))
+    yield line | about
+    line, _ = _timed("learn", partial(learn, program), (state, batch, key))
+    yield line | about
+
+
+def _timed(part: str, call: Callable[..., Any], given: tuple) -> tuple[dict[str, Any], Any]:
+    """Compiles and times a part; returns its line and its result."""
+    began = time.perf_counter()
+    compiled = jax.jit(call).lower(*given).compile(loop.compiler_options())
+    seconds = time.perf_counter() - began
+    result = compiled(*given)
+    taken = timing.time_calls(lambda: jax.block_until_ready(compiled(*given)))
+    line = {
+        "benchmark": "update_parts",
+        "part": part,
+        "ms": 1e3 * statistics.median(taken),
+        "compile_s": seconds,
+    }
+    return line, result
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    for line in results(load_train(arguments)):
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command.run("update_parts", main, TrainConfig))

@@ -1,0 +1,33 @@
+"""Checks that the timed parts of an update are the parts of the training loop's update."""
+
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import update_parts
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training import loop
+from swarmjax.training import program as programs
+
+
+@pytest.mark.slow
+def test_the_parts_make_an_update(tiny_config: TrainConfig) -> None:
+    program, schedule = programs.load(tiny_config)
+    state = jax.jit(partial(loop.init, program))(schedule)
+    _, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
+    waiting = jax.jit(partial(update_parts.draw, program))(schedule, state, level_key)
+    batch = jax.jit(partial(update_parts.collect, program))(state, waiting, rollout_key)
+    found = jax.jit(partial(update_parts.learn, program))(state, batch, learn_key)
+    expected = jax.jit(partial(loop.update, program))(schedule, state)[0].learners
+    for mine, theirs in zip(
+        jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True
+    ):
+        # XLA fuses a part differently from the whole, which changes the rounding of float32.
+        np.testing.assert_allclose(mine, theirs, atol=1e-5)
+    changed = jax.tree.leaves(state.learners.params)
+    assert any(
+        np.abs(np.asarray(mine) - np.asarray(start)).max() > 1e-4
+        for mine, start in zip(jax.tree.leaves(found.params), changed, strict=True)
+    )
