@@ -27,7 +27,6 @@ from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.ppo import optimizer
 from swarmjax.run.settings import load_train
-from swarmjax.task import observation
 
 _LEVELS = 1_000_000  # level numbers reserved for each arena
 
@@ -123,7 +122,7 @@ def vectorised(workers: Workers) -> Any:
     """
     spaces = peers.find("gymnasium.spaces", peers.TORCH)
     base = peers.find("stable_baselines3.common.vec_env", peers.TORCH).VecEnv
-    box = spaces.Box(-np.inf, np.inf, (observation.SIZE,), np.float32)
+    box = spaces.Box(-np.inf, np.inf, workers.first.shape[-1:], np.float32)
     command = spaces.Box(-1.0, 1.0, (mujoco_arena.ACTION_SIZE,), np.float32)
 
     def step_wait(self: Any) -> tuple[Any, ...]:

@@ -105,10 +105,11 @@ class MujocoArena:
 
 def _puppet(settings: EvaluateConfig, action: np.ndarray) -> Policy:
     """Makes a policy that always takes the given actions [R, 2]."""
-    robots, none = len(action), np.zeros((len(action), observation.SIZE), np.float32)
     encoding = resolve_encoding(settings.task, settings.realism)
+    robots, size = len(action), observation.LAYOUTS[encoding].size
+    none = np.zeros((robots, size), np.float32)
     return Policy(
-        layers=[(np.zeros((robots, observation.SIZE, ACTION_SIZE), np.float32), action)],
+        layers=[(np.zeros((robots, size, ACTION_SIZE), np.float32), action)],
         log_std=np.zeros_like(action),
         mean=none,
         std=none + 1.0,

@@ -1,10 +1,13 @@
 """How is the time of an update divided among drawing levels, the rollout and learning?
 
 `python -m benchmarks.update_parts [key=value ...]` takes the keys of `swarmjax.train`. It compiles
-each part of an update as a program of its own, with all stages of the config and untrained
-networks. It prints a JSON line for each part. Together the parts take about as long as an update,
-but not exactly, because XLA optimises each program as a whole. Unlike `benchmarks.profile`, it
-keeps all stages, so it also shows what drawing the levels of different layouts costs.
+each part of an update as a program of its own, and prints a JSON line for each part. The networks
+are untrained, and the arenas are on the stages on which the run begins. To begin on all stages,
+give `curriculum.mode=adaptive` and no `prerequisites`. Unlike `benchmarks.profile`, it keeps all
+stages, so it also shows what drawing the levels of different layouts costs.
+
+The parts do not add up to an update exactly. They leave out the curriculum, the metrics and a
+buffer of levels, and XLA optimises each program as a whole.
 """
 
 import json
@@ -20,6 +23,7 @@ from jax import Array
 
 from benchmarks import steps_per_second, timing
 from swarmjax import command
+from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
@@ -54,7 +58,16 @@ def learn(program: Program, state: TrainState, batch: Batch, key: Array) -> Lear
 
 
 def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
-    """Times each part of an update; yields a line for each."""
+    """Times each part of an update; yields a line for each.
+
+    Raises:
+      ConfigError: if there are several seeds or devices.
+    """
+    for key, count in (("seeds", settings.seeds), ("devices", settings.devices or 1)):
+        if count > 1:
+            raise ConfigError(
+                f"{key} is {count}: give {key}=1, because the parts of one are timed."
+            )
     program, schedule = programs.load(settings)
     state = jax.jit(partial(loop.init, program))(schedule)
     key = jax.random.key(settings.seed)

@@ -2,7 +2,8 @@
 
 `INPUTS` is the table of built-in entries. `layout` describes them to other modules. Policy files,
 evaluations, exports and tests take names, units and sizes from `layout`. To add an input, add one
-row to `INPUTS` and, if the input is a new quantity, one field to `Readings`.
+row to `INPUTS`, its names to `extension.Observation.taken` and, if the input is a new quantity, one
+field to `Readings`.
 """
 
 import math
@@ -52,7 +53,7 @@ class Input(NamedTuple):
 
     Attributes:
       names: names of the entries.
-      read: extracts the entries [..., len(names)] from the readings.
+      read: computes the entries [..., len(names)] from the readings, with `numpy` or `jax.numpy`.
       codings: scaling for each encoding that has these entries.
     """
 

@@ -29,7 +29,8 @@ NAMES = {
     "contacts": "Contacts per robot of each stage, its newest verdict, over arena control steps",
     "return": "Return per robot of each stage, its newest verdict, over arena control steps",
     "mix": "On which stages the arenas were, over arena control steps",
-    "levels": "The levels kept for replay: how many, their share of episodes, success and score",
+    "levels": "Levels kept for replay: their number, the share of episodes that began on them, and "
+    "their success and score, over arena control steps",
 }
 
 

@@ -1,5 +1,6 @@
 """Checks that the timed parts of an update are the parts of the training loop's update."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import update_parts
+from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop
 from swarmjax.training import program as programs
@@ -31,3 +33,16 @@ def test_the_parts_make_an_update(tiny_config: TrainConfig) -> None:
         np.abs(np.asarray(mine) - np.asarray(start)).max() > 1e-4
         for mine, start in zip(jax.tree.leaves(found.params), changed, strict=True)
     )
+
+
+@pytest.mark.slow
+def test_each_part_has_a_line(tiny_config: TrainConfig) -> None:
+    lines = list(update_parts.results(tiny_config))
+    assert [line["part"] for line in lines] == ["draw", "collect", "learn"]
+    assert all(line["ms"] > 0.0 and line["compile_s"] > 0.0 for line in lines)
+
+
+@pytest.mark.parametrize("key", ["seeds", "devices"])
+def test_one_seed_on_one_device_is_timed(tiny_config: TrainConfig, key: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{key} is 2: give {key}=1"):
+        next(update_parts.results(replace(tiny_config, **{key: 2})))
