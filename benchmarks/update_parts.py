@@ -25,7 +25,6 @@ from benchmarks import steps_per_second, timing
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.training import loop, rollout
@@ -48,13 +47,7 @@ def collect(program: Program, state: TrainState, waiting: Arena, key: Array) -> 
 
 def learn(program: Program, state: TrainState, batch: Batch, key: Array) -> LearnerState:
     """Updates all learners."""
-    config = program.config
-    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
-    return jax.vmap(
-        lambda learner, samples, each: ppo.update(
-            learner, config.algo, samples, each, config.updates, program.backend, program.shards
-        )[0]
-    )(explored, batch, jax.random.split(key, config.learners))
+    return loop._learn(program, state.learners, batch, key)[0]
 
 
 def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
@@ -63,7 +56,7 @@ def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
     Raises:
       ConfigError: if there are several seeds or devices.
     """
-    for key, count in (("seeds", settings.seeds), ("devices", settings.devices or 1)):
+    for key, count in (("seeds", settings.seeds), ("devices", settings.devices)):
         if count > 1:
             raise ConfigError(
                 f"{key} is {count}: give {key}=1, because the parts of one are timed."

@@ -319,9 +319,21 @@ def _read_infrared(
         ray = sight.ray
         if factors.dead is not None:
             ray = xp.where(factors.dead, electronics.reach, ray)
-        if encoding != "webots":
-            return xp.minimum(ray, electronics.sensor_range)
+    else:
+        counts = _read_counts(kind, factors, sight, clock, xp)
+        if kind == encoding:
+            return counts
+        # A calibrated robot converts counts back to a distance.
+        ray = response.distance(kind, counts, xp)
+    if encoding == "webots":
         return response.expected("webots", ray, xp)
+    return xp.minimum(ray, electronics.sensor_range)
+
+
+def _read_counts(
+    kind: response.Response, factors: Factors, sight: Sight, clock: Array, xp: Any
+) -> Array:
+    """Samples the counts of sensors with the response `kind`, [..., R, K]."""
     wear = response.Wear(
         factors.infrared_noise, factors.infrared_gain, factors.infrared_offset, factors.dead
     )
@@ -329,14 +341,7 @@ def _read_infrared(
     if factors.infrared_noise is not None:
         shape = sight.ray.shape[-2:]
         normal = noise.normal(factors.seed, clock, Stream.INFRARED, shape, xp)
-    counts = response.read(kind, sight.ray, sight.reflectance, wear, normal, xp)
-    if kind == encoding:
-        return counts
-    # A calibrated robot converts counts back to a distance.
-    ray = response.distance(kind, counts, xp)
-    if encoding != "webots":
-        return xp.minimum(ray, electronics.sensor_range)
-    return response.expected("webots", ray, xp)
+    return response.read(kind, sight.ray, sight.reflectance, wear, normal, xp)
 
 
 def _find_target(

@@ -8,7 +8,7 @@ field to `Readings`.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -184,7 +184,7 @@ def stack(fresh: Array, before: Array, xp: Any) -> Array:
     return xp.concatenate([fresh, before[..., :kept]], axis=-1) if kept else fresh
 
 
-LAYOUTS = {encoding: layout(encoding) for encoding in ("metric", "vector", "webots")}
+LAYOUTS = {encoding: layout(encoding) for encoding in get_args(Encoding)}
 NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size
 

@@ -147,12 +147,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(trajectory, config.algo, shards, state.arenas.recall)
-    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
-    learners, learned = jax.vmap(
-        lambda learner, b, k: ppo.update(
-            learner, config.algo, b, k, config.updates, program.backend, shards
-        )
-    )(explored, batch, jax.random.split(learn_key, config.learners))
+    learners, learned = _learn(program, state.learners, batch, learn_key)
     counted = curricula.count(state.curriculum, ended, shards)
     curriculum, decision = curricula.advance(
         counted, schedule, config.curriculum, program.mode, state.update
@@ -189,6 +184,19 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         update=state.update + 1,
     )
     return new, metrics
+
+
+def _learn(
+    program: Program, learners: LearnerState, batch: Batch, key: Array
+) -> tuple[LearnerState, Metrics]:
+    """Updates all learners with the batch of a rollout; returns them and what PPO reports."""
+    config = program.config
+    explored = rollout.explore(program, learners, config.algo.rollout_length)
+    return jax.vmap(
+        lambda learner, b, k: ppo.update(
+            learner, config.algo, b, k, config.updates, program.backend, program.shards
+        )
+    )(explored, batch, jax.random.split(key, config.learners))
 
 
 def _every_source(arenas: Arena, waiting: Arena) -> LevelSource | None:

@@ -28,10 +28,10 @@ def test_the_parts_make_an_update(tiny_config: TrainConfig) -> None:
     ):
         # XLA fuses a part differently from the whole, which changes the rounding of float32.
         np.testing.assert_allclose(mine, theirs, atol=1e-5)
-    changed = jax.tree.leaves(state.learners.params)
+    starts = jax.tree.leaves(state.learners.params)
     assert any(
         np.abs(np.asarray(mine) - np.asarray(start)).max() > 1e-4
-        for mine, start in zip(jax.tree.leaves(found.params), changed, strict=True)
+        for mine, start in zip(jax.tree.leaves(found.params), starts, strict=True)
     )
 
 
