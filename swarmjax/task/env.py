@@ -258,7 +258,8 @@ def look_around(world: World, state: EnvState) -> Array:
       [R, P], as `surroundings.look` returns it.
     """
     pose = physics.poses(world.physics, state.sim)
-    return surroundings.look(pose, state.level, state.arrived)
+    to_go = state.distance if state.path is None else state.path.distance
+    return surroundings.look(pose, state.level, state.arrived, to_go)
 
 
 def _no_episode(robots: int) -> Episode:

@@ -21,28 +21,30 @@ NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
 # up to this wide. The numbers are not normalised: most rows are 0, so a running deviation would be
 # small and would magnify the first entries.
 REACH = 2.0
+FARTHEST = 4.0  # m; the largest distance to go that is shown, because paths wind around walls
 
-_OWN = 3  # target x, y; arrived
+_OWN = 4  # target x, y; arrived; distance to go
 _ROBOT = 8  # presence; x, y, heading x, y, target x, y, arrived
 _RECTANGLE = 8  # presence; nearest x, y, right end x, y, left end x, y, half the short edge
 
 SIZE = _OWN + NEAREST_ROBOTS * _ROBOT + NEAREST_RECTANGLES * _RECTANGLE  # entries, P
 
 
-def look(pose: Array, level: Level, arrived: Array) -> Array:
+def look(pose: Array, level: Level, arrived: Array, to_go: Array) -> Array:
     """Lists the surroundings of each robot of one arena.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad).
       level: level of the episode.
       arrived: [R] whether the robot has arrived.
+      to_go: [R] distance to the target, along the shortest path if it is known, m.
 
     Returns:
-      [R, P] in the robots' frames, x forward. Lengths are in m, within +-2. Directions are within
-      +-1. Flags are 0 or 1. Rows of absent objects are 0.
+      [R, P] in the robots' frames, x forward. Lengths are in m, within +-2; the distance to go is
+      within 4. Directions are within +-1. Flags are 0 or 1. Rows of absent objects are 0.
     """
     target = _shown(*into_frame(pose, level.target))
-    own = [*target, arrived.astype(jnp.float32)]
+    own = [*target, arrived.astype(jnp.float32), jnp.minimum(to_go, FARTHEST)]
     parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
     found = jnp.concatenate(parts, axis=-1)
     # Learning skips an arena with broken physics, but its critic still needs finite numbers.

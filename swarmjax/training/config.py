@@ -12,8 +12,8 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# Each arena gets one waiting episode per this many control steps of a rollout. The shortest
-# episodes of the six stages take 23 steps.
+# By default, each arena gets one waiting episode per this many control steps of a rollout. The
+# shortest episodes of the six stages take 23 steps.
 _STEPS_PER_EPISODE = 32
 
 
@@ -71,6 +71,15 @@ class ProgramConfig(Section):
     budget: int = field(
         default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
     )
+    levels_per_rollout: int | None = field(
+        default=None,
+        metadata=about(
+            "levels drawn for each arena before a rollout; an arena that needs more repeats the "
+            "last one, which then counts for no success; null: one for each 32 control steps",
+            1,
+            1024,
+        ),
+    )
     realism: RealismConfig = field(default_factory=RealismConfig)
     extensions: str | None = field(
         default=None, metadata=about("Python file with your own extension; it is executed")
@@ -108,4 +117,4 @@ class ProgramConfig(Section):
     @property
     def waiting(self) -> int:
         """Number of episodes that are drawn for each arena before a rollout."""
-        return max(1, self.algo.rollout_length // _STEPS_PER_EPISODE)
+        return self.levels_per_rollout or max(1, self.algo.rollout_length // _STEPS_PER_EPISODE)

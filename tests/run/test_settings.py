@@ -133,8 +133,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "algo.actor_learning_rate?"),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
-         "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, realism, "
-         "extensions, run, resume, init_from, init_from_std."),
+         "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, "
+         "levels_per_rollout, realism, extensions, run, resume, init_from, init_from_std."),
         # Words that Hydra's grammar refuses.
         (["algo.hidden_sizes=[64"], "'algo.hidden_sizes=[64' cannot be read: quote a value with "
          "special characters, as in \"algo.hidden_sizes='a=b'\"."),

@@ -119,6 +119,7 @@ def test_paths_are_as_long_as_those_of_the_judge(drawn: Level) -> None:
 class Driven(NamedTuple):
     """The first and last state of an episode, and its rewards, which are path progress alone."""
 
+    world: env.World
     began: env.EnvState
     ended: env.EnvState
     rewards: np.ndarray
@@ -140,7 +141,7 @@ def driven() -> Driven:
         return state, came.reward
 
     ended, rewards = jax.jit(lambda *given: jax.lax.scan(step, *given))(began, actions)
-    return Driven(began, ended, np.asarray(rewards)[:, 0])
+    return Driven(world, began, ended, np.asarray(rewards)[:, 0])
 
 
 def test_rewards_add_up_to_how_much_shorter_the_path_is(driven: Driven) -> None:
@@ -157,6 +158,19 @@ def test_an_arena_keeps_the_path_from_where_its_robot_is(driven: Driven) -> None
     now = np.asarray(driven.ended.sim.qpos)[:2]
     drawn = _level(list(now), [0.3, 0.1], [WALL])
     assert float(driven.ended.path.distance[0]) == pytest.approx(_distance(drawn), abs=1e-5)
+
+
+def test_a_critic_of_the_state_sees_how_long_the_path_is(driven: Driven) -> None:
+    assert driven.ended.path is not None
+    seen = env.look_around(driven.world, driven.ended)
+    straight, path = driven.ended.distance[0], driven.ended.path.distance[0]
+    assert path > straight + 0.05  # m; the wall is in the way
+    assert seen[0, 3] == path
+
+
+def test_without_paths_it_sees_the_straight_distance(driven: Driven) -> None:
+    seen = env.look_around(driven.world, dataclasses.replace(driven.ended, path=None))
+    assert seen[0, 3] == driven.ended.distance[0]
 
 
 def test_without_its_weight_no_path_is_kept(tiny_world: env.World) -> None:

@@ -9,6 +9,8 @@ from swarmjax.task import surroundings
 from swarmjax.task.level import Level
 
 ROUND = 1e-6  # float32, numbers of about 1
+TO_GO = 0.7  # m
+OWN = surroundings._OWN
 
 
 def _level(robots: int, boxes: np.ndarray, side: float = 1.0, target: float = 0.0) -> Level:
@@ -25,17 +27,18 @@ def _level(robots: int, boxes: np.ndarray, side: float = 1.0, target: float = 0.
 
 def _look(pose: np.ndarray, level: Level, arrived: np.ndarray | None = None) -> np.ndarray:
     there = np.zeros(len(pose), bool) if arrived is None else arrived
-    found = jax.jit(surroundings.look)(pose.astype(np.float32), level, there)
+    to_go = np.full(len(pose), TO_GO, np.float32)
+    found = jax.jit(surroundings.look)(pose.astype(np.float32), level, there, to_go)
     assert found.shape == (len(pose), surroundings.SIZE)
     return np.asarray(found)
 
 
 def _robots(row: np.ndarray) -> np.ndarray:
-    return row[3 : 3 + 8 * surroundings.NEAREST_ROBOTS].reshape(-1, 8)
+    return row[OWN : OWN + 8 * surroundings.NEAREST_ROBOTS].reshape(-1, 8)
 
 
 def _rectangles(row: np.ndarray) -> np.ndarray:
-    return row[3 + 8 * surroundings.NEAREST_ROBOTS :].reshape(-1, 8)
+    return row[OWN + 8 * surroundings.NEAREST_ROBOTS :].reshape(-1, 8)
 
 
 def test_a_target_is_seen_in_the_robots_frame() -> None:
@@ -43,6 +46,13 @@ def test_a_target_is_seen_in_the_robots_frame() -> None:
     # The robot is at (0.1, 0.1) and faces north: its target is 0.1 m ahead and 0.2 m to the right.
     row = _look(np.array([[0.1, 0.1, np.pi / 2]]), level, np.array([True]))[0]
     np.testing.assert_allclose(row[:3], [0.1, -0.2, 1.0], atol=ROUND)
+
+
+@pytest.mark.parametrize(("to_go", "shown"), [(0.0, 0.0), (3.9, 3.9), (4.1, 4.0)])
+def test_the_distance_to_go_is_shown_up_to_4_metres(to_go: float, shown: float) -> None:
+    level, pose = _level(1, np.zeros((0, 5))), np.zeros((1, 3), np.float32)
+    found = surroundings.look(pose, level, np.zeros(1, bool), np.float32([to_go]))
+    np.testing.assert_allclose(found[0, 3], shown, atol=ROUND)
 
 
 def test_another_robot_is_seen_with_its_heading_and_its_target() -> None:

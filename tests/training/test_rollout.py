@@ -439,6 +439,10 @@ def test_a_long_rollout_draws_an_episode_for_every_32_control_steps(
     assert [waiting(steps) for steps in (1, 32, 63, 64, 6000)] == [1, 1, 1, 2, 187]
 
 
+def test_a_run_may_choose_how_many_episodes_are_drawn(tiny_config: TrainConfig) -> None:
+    assert dataclasses.replace(tiny_config, levels_per_rollout=3).waiting == 3
+
+
 def test_episodes_that_wait_are_begun_in_turn_and_all_count(
     program: Program, run: Run, draw: Draw
 ) -> None:

@@ -4,8 +4,8 @@ XLA launches several kernels for each step of a sequence, and passes data betwee
 GPU's memory. Here a program of the grid holds a tile of sequences and their memory, and runs all
 steps.
 
-T stands for control steps, B for sequences, F for features, H for the memory's width, `tile` for
-the sequences that a program holds, and P for programs.
+T stands for control steps, B for sequences, F for features, H for the memory's width, and `tile`
+for the sequences that a program holds.
 """
 
 import functools
@@ -17,12 +17,20 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
+from swarmjax.ppo.fast import kernel as hardware
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. In the backward pass on an H100, 8 warps took twice as long with 64
-# sequences. With 32 sequences, 4 warps were slower than 8 (docs/performance.md).
-TILE = 32
+# Sequences of a tile. Up to `MOST_SMALL` sequences, the smaller tile gives more of the chip's
+# processors a program, and is faster on an H100; with more sequences the larger one is faster. In
+# the backward pass, 8 warps took twice as long with 64 sequences. With 32 sequences, 4 warps were
+# slower than 8 (docs/performance.md).
+SMALL_TILE, TILE = 16, 32
+MOST_SMALL = 8192
 _WARPS, _BACKWARD_WARPS = 4, 8
+# Steps that the backward pass has in flight: it loads the inputs of the next steps while it
+# computes one. On an H100 this takes 0.4 to 0.65 of the time without. The forward pass became
+# slower.
+_STAGES = 3
 # The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took
 # 8 % less time on an H100. The rollout rounds in the same way, so that ratios of probabilities
 # begin at 1.
@@ -106,7 +114,34 @@ def fits(size: int, shared_memory: int) -> bool:
     Returns:
       Whether `remember_all` may be called.
     """
-    return size in _SIZES and 4 * (2 * size * 3 * size + 4 * TILE * size) <= shared_memory
+    return size in _SIZES and _bytes(size) <= shared_memory
+
+
+def _bytes(size: int) -> int:
+    """Returns the bytes on the chip for a program that has one step in flight."""
+    return 4 * (2 * size * 3 * size + 4 * TILE * size)
+
+
+def _tile(sequences: int) -> int:
+    """Chooses the sequences of a tile for a number of sequences."""
+    return SMALL_TILE if sequences <= MOST_SMALL else TILE
+
+
+def _stages(size: int, shared_memory: int) -> int:
+    """Chooses how many steps of the backward pass are in flight.
+
+    Each further step holds a tile of its inputs on the chip: three gates in bfloat16, and the
+    memory before, the first memory and the derivative in float32.
+
+    Args:
+      size: H.
+      shared_memory: Bytes on the chip for a program.
+
+    Returns:
+      1 if the inputs of further steps do not fit beside what `fits` counts.
+    """
+    inputs = TILE * size * (3 * 2 + 3 * 4)
+    return _STAGES if _bytes(size) + (_STAGES - 1) * inputs <= shared_memory else 1
 
 
 def remember_all(
@@ -167,10 +202,10 @@ def remember(
 def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
     """Runs the unit through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
-    steps = len(sequences.seen) // count
+    steps, tile = len(sequences.seen) // count, _tile(count)
     every = pl.pallas_call(
-        functools.partial(_forward, steps),
-        grid=(pl.cdiv(count, TILE),),
+        functools.partial(_forward, steps, tile),
+        grid=(pl.cdiv(count, tile),),
         out_shape=jax.ShapeDtypeStruct((steps * count, size), jnp.float32),
         compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
         interpret=interpret,
@@ -190,7 +225,8 @@ def _through_backward(
     """Backpropagates from the memories [T, B, H] to weights, inputs and first memories."""
     weights, sequences, every = kept
     steps, count, size = every.shape
-    programs = pl.cdiv(count, TILE)
+    tile = _tile(count)
+    programs = pl.cdiv(count, tile)
     shapes = {
         "kernel": jax.ShapeDtypeStruct((programs * size, 3 * size), jnp.float32),
         "sums": jax.ShapeDtypeStruct((programs, 4 * size), jnp.float32),
@@ -198,10 +234,12 @@ def _through_backward(
         "memory": jax.ShapeDtypeStruct((count, size), jnp.float32),
     }
     found = pl.pallas_call(
-        functools.partial(_backward, steps),
+        functools.partial(_backward, steps, tile),
         grid=(programs,),
         out_shape=shapes,
-        compiler_params=triton.CompilerParams(num_warps=_BACKWARD_WARPS, num_stages=1),
+        compiler_params=triton.CompilerParams(
+            num_warps=_BACKWARD_WARPS, num_stages=_stages(size, hardware.shared_memory())
+        ),
         interpret=interpret,
     )(weights, sequences, every.reshape(-1, size), slope.reshape(-1, size))
     by_kernel = found["kernel"].reshape(programs, size, 3 * size).sum(axis=0)
@@ -218,10 +256,10 @@ def _through_backward(
 _through.defvjp(_through_forward, _through_backward)
 
 
-def _forward(steps: int, weights: _Weights, sequences: _Sequences, every: Any) -> None:
+def _forward(steps: int, tile: int, weights: _Weights, sequences: _Sequences, every: Any) -> None:
     """Runs one program: a tile of sequences from first step to last; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
-    own = _own(count)
+    own = _own(count, tile)
 
     def step(t: jax.Array, before: jax.Array) -> jax.Array:
         rows = _rows(own, t * count)
@@ -236,6 +274,7 @@ def _forward(steps: int, weights: _Weights, sequences: _Sequences, every: Any) -
 
 def _backward(
     steps: int,
+    tile: int,
     weights: _Weights,
     sequences: _Sequences,
     every: Any,
@@ -244,7 +283,7 @@ def _backward(
 ) -> None:
     """Runs one program: a tile of sequences from last step to first; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
-    own = _own(count)
+    own = _own(count, tile)
 
     def step(i: jax.Array, sofar: Any) -> Any:
         later, products, totals = sofar
@@ -263,7 +302,7 @@ def _backward(
         return by_before * goes_on, *jax.tree.map(jnp.add, (products, totals), (product, total))
 
     square, row = jnp.zeros((size, size), jnp.float32), jnp.zeros(size, jnp.float32)
-    begun = jnp.zeros((TILE, size), jnp.float32), (square,) * 3, (row,) * 4
+    begun = jnp.zeros((tile, size), jnp.float32), (square,) * 3, (row,) * 4
     later, products, totals = jax.lax.fori_loop(0, steps, step, begun)
     _write(found["memory"], own, 0, later)
     _write_sums(found, products, totals)
@@ -314,9 +353,9 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
     return seen, (by_reset, by_update, by_candidate * reset), slope * update
 
 
-def _own(count: int) -> _Rows:
+def _own(count: int, tile: int) -> _Rows:
     """Returns this program's sequences at the first step; to be called outside of a loop."""
-    at = pl.program_id(0) * TILE + jnp.arange(TILE)
+    at = pl.program_id(0) * tile + jnp.arange(tile)
     return _Rows(at, at < count)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from swarmjax.ppo import dispatch, memory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.fast import recurrence
+from swarmjax.ppo.fast import kernel, recurrence
 from swarmjax.ppo.memory import Gru
 
 STEPS, WIDTH, SIZE = 5, 7, 16
@@ -47,11 +47,19 @@ def _by_xla(weights: recurrence._Weights, seen: Any, begins: Any, before: Any) -
     return memory.remember_all(*given)
 
 
+@pytest.fixture(params=[0, ROWS], ids=["large tiles", "small tiles"])
+def tile(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets the kernels take large or small tiles."""
+    monkeypatch.setattr(recurrence, "MOST_SMALL", request.param)
+
+
+@pytest.mark.usefixtures("tile")
 def test_memories_are_those_of_the_unit() -> None:
     found, expected = (f(_weights(), *_sequences()) for f in (_by_kernels, _by_xla))
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUND)
 
 
+@pytest.mark.usefixtures("tile")
 def test_gradients_are_those_of_the_unit() -> None:
     seen, begins, before = _sequences()
     towards = _drawn(STEPS, ROWS, SIZE, seed=6)
@@ -110,6 +118,15 @@ def test_learners_have_kernels_of_their_own() -> None:
     found = jax.vmap(lambda own: _by_kernels(own, *given))(weights)
     second = jax.tree.map(lambda x: 2.0 * x, _weights())
     np.testing.assert_allclose(found[1], _by_kernels(second, *given), rtol=0, atol=ROUND)
+
+
+@pytest.mark.parametrize(
+    ("size", "capability", "steps"),
+    # A memory of 64 units takes 131,072 bytes, and the inputs of two further steps 73,728.
+    [(64, "9.0", 3), (64, "8.0", 1), (32, "8.0", 3)],
+)
+def test_a_small_chip_has_one_step_in_flight(size: int, capability: str, steps: int) -> None:
+    assert recurrence._stages(size, kernel._MORE_SHARED_MEMORY[capability]) == steps
 
 
 class TestWhereTheyAreUsed:
