@@ -16,6 +16,7 @@ from swarmjax.sim.drive import COMMAND_SIZE
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import NeighboursConfig
+from swarmjax.task.nearest import nearest
 
 Array = Any
 
@@ -125,7 +126,7 @@ def listen(
     if lost is not None:
         distance = xp.where(lost < realism.packet_loss, xp.inf, distance)
     kept = min(settings.count, robots)
-    order = xp.argsort(distance, axis=-1, stable=True)[..., :kept]
+    order = nearest(distance, kept, xp)
     is_there = xp.isfinite(xp.take_along_axis(distance, order, axis=-1))
     off = _draw(
         realism.neighbour_distance_noise, noise.normal, seed, clock, Stream.RANGE, robots, xp

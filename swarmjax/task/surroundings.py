@@ -14,6 +14,7 @@ from jax import Array
 
 from swarmjax.sim import model
 from swarmjax.task.level import Level
+from swarmjax.task.nearest import nearest
 
 NEAREST_ROBOTS = 8
 NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
@@ -110,7 +111,7 @@ def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array
       [R, n] indices of the chosen objects, and [R, n] whether they are present.
     """
     ranked = jnp.where(is_there, distance, jnp.inf)
-    _, chosen = jax.lax.top_k(-ranked, min(count, distance.shape[1]))
+    chosen = nearest(ranked, min(count, distance.shape[1]), jnp)
     there = jnp.broadcast_to(is_there, distance.shape)
     return chosen, jnp.take_along_axis(there, chosen, axis=1)
 

@@ -1,0 +1,30 @@
+"""Tests the order of objects by distance, against NumPy's stable sort."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from swarmjax.task.nearest import nearest
+
+# Few different distances, so that many are equal.
+DISTANCES = arrays.arrays(
+    np.float32,
+    st.tuples(st.just(3), st.integers(1, 9)),
+    elements=st.sampled_from([0, 1, 2, np.inf]),
+)
+
+
+@given(DISTANCES, st.data())
+def test_it_is_that_of_a_stable_sort(distance: np.ndarray, data: st.DataObject) -> None:
+    count = data.draw(st.integers(1, distance.shape[1]))
+    expected = np.argsort(distance, axis=-1, stable=True)[:, :count]
+    np.testing.assert_array_equal(nearest(distance, count, np), expected)
+
+
+def test_jax_gives_the_same_order() -> None:
+    distance = np.float32([[0.3, 0.1, np.inf, 0.1], [2.0, 1.0, 0.5, 0.0]])
+    found = jax.jit(lambda x: nearest(x, 3, jnp))(distance)
+    np.testing.assert_array_equal(found, [[1, 3, 0], [3, 2, 1]])
