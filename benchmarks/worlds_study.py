@@ -1,7 +1,7 @@
 """Does a curriculum help on worlds with walls? Also compares level replay, memory and messages.
 
 `python -m benchmarks.worlds_study arms=random,adaptive [key=value ...]` trains each arm on the ten
-families of `stage=worlds`, one seed after another in one program. It judges every seed at several
+families of `stage=worlds10`, all seeds side by side in one program. It judges every seed at several
 points of its training, on the device. All arms are judged on the same new levels of each family,
 with the obstacle sizes of the suite `worlds`. It prints a JSON line for each arm as soon as the arm
 is done. It takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
@@ -34,8 +34,8 @@ from swarmjax.training import seeds
 # (docs/worlds.md).
 RECIPE = [
     "seeds=10",
-    "seeds_by=map",
-    "stage=worlds",
+    "stage=worlds10",
+    "levels_per_rollout=1",
     "task.step_limit=1500",
     "task.reward.progress=0",
     "task.reward.path_progress=1",
@@ -46,8 +46,8 @@ RECIPE = [
     "algo.gae_lambda=0.98",
     "algo.num_minibatches=32",
     "algo.epochs=2",
-    "arenas=8192",
-    "budget=1e8",
+    "arenas=4096",
+    "budget=8e7",
     "curriculum.success=all",
 ]
 _EVENLY = ["curriculum.mode=adaptive", "curriculum.floor=1", "curriculum.shares=robots"]
@@ -172,11 +172,11 @@ def load_judge(study: Study, trained: TrainConfig) -> curriculum.Judge:
         trained.task,
         trained.realism,
         trained.sim,
-        arenas=len(stages) * study.levels,
+        arenas=len(stages) * study.levels * trained.seeds,
     )
     levels = curriculum.draw_levels(world, stages, study.level_seed, study.levels)
     run = partial(engine_mjx.outcomes, world, config, steps=study.steps, sampled=True)
-    call = jax.jit(lambda learners: jax.lax.map(lambda one: run(one, levels), learners))
+    call = jax.jit(jax.vmap(lambda learners: run(learners, levels)))
     names = [stage.name for stage in stages]
     return lambda learners: curriculum.means(call(learners), names)
 

@@ -18,7 +18,7 @@ def test_arms_train_on_all_families_with_one_recipe(arm: Arm) -> None:
     assert len(config.stage) == 10
     assert (config.algo.memory, config.algo.critic) == ("gru", "state")
     assert config.task.neighbours.count == 4
-    assert (config.seeds, config.budget) == (10, 100_000_000)
+    assert (config.seeds, config.budget) == (10, 80_000_000)
 
 
 @pytest.mark.parametrize(

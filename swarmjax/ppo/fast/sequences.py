@@ -27,7 +27,7 @@ CPU_TILE = 32
 # Fewest and most samples of a tile on an accelerator. An accelerator runs one step after the other,
 # so a large tile takes little longer than a small one. With default layers, the largest tile takes
 # about 12 GB for each learner and seed.
-TILE_SAMPLES = 2**16, 2**21
+TILE_SAMPLES = 2**17, 2**21
 # Between these bounds, an accelerator splits a full minibatch into this many tiles. Where most
 # robots are absent, most of the tiles are left out.
 _TILES = 4
