@@ -159,8 +159,14 @@ def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
 
 
 def _gru(config: AlgoConfig) -> Gru:
-    uniform = config.initialization == "uniform"
-    return Gru(_memory_size(config), uniform, config.memory_kernels, name="memory")
+    assert config.memory_span is not None  # the config has filled it in
+    return Gru(
+        _memory_size(config),
+        uniform=config.initialization == "uniform",
+        span=config.memory_span,
+        kernels=config.memory_kernels,
+        name="memory",
+    )
 
 
 def _memory_size(config: AlgoConfig) -> int:

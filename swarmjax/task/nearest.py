@@ -8,11 +8,12 @@ Array = Any
 def nearest(distance: Array, count: int, xp: Any) -> Array:
     """Orders objects by distance.
 
-    It counts how many objects are nearer than each one. On a GPU and on a CPU, this is faster than
-    sorting rows this short.
+    It counts how many objects are nearer than each one. On a CPU, this is faster than sorting rows
+    this short (docs/performance.md).
 
     Args:
-      distance: [..., N] of N objects, m; inf comes last. None may be NaN.
+      distance: [..., N] of N objects, m; inf comes last. If any is NaN, the indices have no
+        meaning, but lie within 0 to N - 1.
       count: how many objects to return, at most N.
       xp: `numpy` or `jax.numpy`.
 

@@ -87,8 +87,8 @@ def _rectangles(pose: Array, level: Level) -> Array:
     is_left = one[0] * other[1] - one[1] * other[0] >= 0.0  # of `other`, seen from the robot
     right = _shown(*(jnp.where(is_left, a, b) for a, b in zip(one, other, strict=True)))
     left = _shown(*(jnp.where(is_left, b, a) for a, b in zip(one, other, strict=True)))
-    nearest = _shown(*into_frame(viewer, _to_rectangle(pose, found)[0]))
-    rows = (1.0, *nearest, *right, *left, jnp.minimum(half_x, half_y))
+    closest = _shown(*into_frame(viewer, _to_rectangle(pose, found)[0]))
+    rows = (1.0, *closest, *right, *left, jnp.minimum(half_x, half_y))
     return _listed(rows, is_there, NEAREST_RECTANGLES)
 
 

@@ -20,15 +20,16 @@ from jax.experimental.pallas import triton
 from swarmjax.ppo.fast import kernel as hardware
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. Up to `MOST_SMALL` sequences, the smaller tile gives more of the chip's
-# processors a program, and is faster on an H100; with more sequences the larger one is faster. In
-# the backward pass, 8 warps took twice as long with 64 sequences. With 32 sequences, 4 warps were
-# slower than 8 (docs/performance.md).
+# Sequences of a tile. Up to `MOST_SMALL` sequences of a learner, the smaller tile gives more of the
+# chip's processors a program, and is faster on an H100. With more sequences, the backward pass is
+# faster with the larger tile. Several seeds side by side fill the chip earlier; that was not timed.
+# In the backward pass, 8 warps took twice as long with 64 sequences. With 32 sequences, 4 warps
+# were slower than 8 (docs/performance.md).
 SMALL_TILE, TILE = 16, 32
 MOST_SMALL = 8192
 _WARPS, _BACKWARD_WARPS = 4, 8
 # Steps that the backward pass has in flight: it loads the inputs of the next steps while it
-# computes one. On an H100 this takes 0.4 to 0.65 of the time without. The forward pass became
+# computes one. On an H100 this takes 0.56 to 0.64 of the time without. The forward pass became
 # slower.
 _STAGES = 3
 # The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took

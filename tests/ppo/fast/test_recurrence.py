@@ -120,6 +120,10 @@ def test_learners_have_kernels_of_their_own() -> None:
     np.testing.assert_allclose(found[1], _by_kernels(second, *given), rtol=0, atol=ROUND)
 
 
+def test_only_many_sequences_take_large_tiles() -> None:
+    assert [recurrence._tile(count) for count in (1, 8192, 8193)] == [16, 16, 32]
+
+
 @pytest.mark.parametrize(
     ("size", "capability", "steps"),
     # A memory of 64 units takes 131,072 bytes, and the inputs of two further steps 73,728.
