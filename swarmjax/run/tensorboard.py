@@ -88,9 +88,8 @@ class Board:
     def add(self, row: Row, arena_steps: int) -> None:
         """Writes the numbers of a row."""
         event = _event(arena_steps)
-        for name, value in row.items():
-            if isinstance(value, int | float):
-                event.summary.value.add(tag=name, simple_value=value)
+        for name, value in numbers(row).items():
+            event.summary.value.add(tag=name, simple_value=value)
         self._writer.write_event(event)
 
     def add_picture(self, name: str, png: bytes, arena_steps: int) -> None:
@@ -116,6 +115,22 @@ class Board:
     def close(self) -> None:
         """Writes the remaining events."""
         self._writer.close()
+
+
+def numbers(row: Row) -> dict[str, float]:
+    """Lists the numbers of a row by name.
+
+    A list has a number for each stage of the curriculum. The number of stage i gets the name of the
+    list, a slash and i, from 0. Entries without a number are left out.
+    """
+    found = {}
+    for name, value in row.items():
+        if isinstance(value, list):
+            parts = {f"{name}/{i}": part for i, part in enumerate(value)}
+        else:
+            parts = {name: value}
+        found |= {key: part for key, part in parts.items() if isinstance(part, int | float)}
+    return found
 
 
 def _event(arena_steps: int) -> Any:

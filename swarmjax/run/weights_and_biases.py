@@ -9,7 +9,7 @@ from typing import Any
 from swarmjax.config import ConfigError, show, to_dict
 from swarmjax.run.directory import Row
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.tensorboard import BOARDS
+from swarmjax.run.tensorboard import BOARDS, numbers
 
 EXTRA = "wandb"
 
@@ -67,7 +67,7 @@ class WandbRuns:
         mine = [row for row in rows if row["seed"] in self._seeds]
         last = [row for row in mine if row["seed"] == self._seeds[0]][-1]
         for row in mine:
-            self._of(row["seed"]).log(_numbers(row | speeds if row is last else row))
+            self._of(row["seed"]).log(numbers(row | speeds if row is last else row))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
         """Writes a PNG as an image, or a page as HTML, to the first seed's run."""
@@ -118,8 +118,3 @@ class WandbRuns:
 def _wandb() -> Any:
     """Imports the library, which is an optional extra and takes seconds to import."""
     return importlib.import_module("wandb")
-
-
-def _numbers(row: Row) -> Row:
-    """Returns the entries that are numbers, as for TensorBoard."""
-    return {name: value for name, value in row.items() if isinstance(value, int | float)}

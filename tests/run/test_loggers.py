@@ -84,7 +84,11 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
 
 
 def _numbers(row: dict) -> dict[str, float]:
-    return {name: value for name, value in row.items() if isinstance(value, int | float)}
+    """Returns the numbers of a row; that of stage i has the name of its list, a slash and i."""
+    found: dict[str, float] = {k: v for k, v in row.items() if isinstance(v, int | float)}
+    for name in (k for k, v in row.items() if isinstance(v, list)):
+        found |= {f"{name}/{i}": v for i, v in enumerate(row[name]) if v is not None}
+    return found
 
 
 def _events(file: Path) -> Iterator[Any]:
@@ -146,7 +150,7 @@ def test_a_logger_is_closed_once_and_last(told: Told) -> None:
 def test_wandb_offline_has_the_numbers_of_the_record(told: Told) -> None:
     (file,) = told.run.glob("wandb/offline-run-*/run-*.wandb")
     found = [
-        {name: value for name, value in row.items() if name in told.rows[0]}
+        {name: value for name, value in row.items() if name.split("/")[0] in told.rows[0]}
         for row in _histories(file)
     ]
     assert found == [_numbers(row) for row in told.rows]
