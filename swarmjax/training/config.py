@@ -14,7 +14,7 @@ from swarmjax.task.stage_config import StageConfig
 
 # By default, each arena gets one waiting episode per this many control steps of a rollout. The
 # shortest episodes of the six stages take 23 steps.
-_STEPS_PER_EPISODE = 32
+STEPS_PER_EPISODE = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,4 +117,4 @@ class ProgramConfig(Section):
     @property
     def waiting(self) -> int:
         """Number of episodes that are drawn for each arena before a rollout."""
-        return self.levels_per_rollout or max(1, self.algo.rollout_length // _STEPS_PER_EPISODE)
+        return self.levels_per_rollout or max(1, self.algo.rollout_length // STEPS_PER_EPISODE)

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from swarmjax.task.episode import Ended, Robots
-from swarmjax.training.config import ProgramConfig
+from swarmjax.training.config import STEPS_PER_EPISODE, ProgramConfig
 
 KEY = "episodes_log"  # key in the metrics of an update
 MOST_HELD = 2**19  # most episodes that a call may return, over all updates and seeds
@@ -43,12 +43,13 @@ class EpisodeLog(NamedTuple):
 def room(config: ProgramConfig) -> int:
     """Returns the most episodes of one update and seed that are kept.
 
-    For each arena this is the larger of two numbers. One is the waiting episodes plus the one under
-    way. The other is the number of episodes that the step limit ends. No arena ends more than one
-    episode at each control step.
+    An arena ends the episode under way and the waiting ones. If fewer wait than by default, it
+    repeats the last one, so it has the room of the default. A short step limit ends more episodes.
+    No arena ends more than one episode at each control step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
-    return config.arenas * min(steps, max(config.waiting, steps // limit) + 1)
+    usual = max(config.waiting, steps // STEPS_PER_EPISODE, steps // limit)
+    return config.arenas * min(steps, usual + 1)
 
 
 def rows_of_call(config: ProgramConfig) -> int:

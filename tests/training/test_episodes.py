@@ -87,6 +87,13 @@ def test_there_is_room_for_all_that_can_be_drawn() -> None:
     assert paper.waiting < episodes.room(paper)
 
 
+def test_fewer_drawn_levels_take_no_room_away() -> None:
+    """An arena that runs out of levels repeats the last one, and these episodes end, too."""
+    paper = load_train(["algo=paper"])
+    fewer = replace(paper, levels_per_rollout=1)
+    assert episodes.room(fewer) == episodes.room(paper)
+
+
 Train = Callable[..., None]
 
 
