@@ -85,7 +85,7 @@ def minibatch(key: jax.Array, params: Params, algo: AlgoConfig, size: int) -> Mi
         begins=None if memory is None else jnp.zeros(size, bool),
         state=state if algo.critic == "state" else None,
     )
-    mean, std, _ = losses.evaluate(params, algo, drawn)
+    (mean, std, *_), _ = losses.evaluate(params, algo, drawn)
     return replace(drawn, log_prob=drawn.log_prob + networks.log_prob(mean, std, drawn.action))
 
 

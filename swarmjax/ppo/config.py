@@ -13,6 +13,7 @@ _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
     "gae_lambda": ("advantage", "gae", 0.95),
     "memory_size": ("memory", "gru", 64),
     "memory_span": ("memory", "gru", 2),
+    "guess_cost": ("critic", "state", 0.02),
     "std_decrement": ("exploration", "scheduled", 0.05),
     "std_interval": ("exploration", "scheduled", 250_000),
     "std_floor": ("exploration", "scheduled", 0.1),
@@ -191,6 +192,14 @@ class AlgoConfig(Section):
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
+    guess_cost: float | None = field(
+        default=None,
+        metadata=about(
+            "weight of the squared error of the policy's guess of the state that the critic sees; "
+            "null: 0.02 [critic=state]",
+            0.0,
+        ),
+    )
     bound_cost: float = field(
         default=1500.0,
         metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),

@@ -8,7 +8,7 @@ from flax import struct
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import Recall
-from swarmjax.ppo.networks import Params
+from swarmjax.ppo.networks import Acted, Params
 
 Metrics = dict[str, jax.Array]
 
@@ -46,7 +46,8 @@ def ppo_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
-    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound.
+    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound + guess_cost *
+    guess.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
@@ -59,6 +60,9 @@ def ppo_loss(
     This term follows `bounds_loss` of rl_games, which begins at 1.1. If the mean lies several
     deviations beyond the range, all drawn actions have the same effect, and the policy learns
     nothing from them.
+
+    The guess term exists if the critic sees the state. It is the squared error of the actor's guess
+    of the state, summed over the numbers of the state.
 
     Each term is a sum over the valid samples divided by `expected_valid`. Every valid sample of a
     batch then has the same weight, even if the minibatches are filled unevenly. The mean over the
@@ -73,8 +77,8 @@ def ppo_loss(
 
     Returns:
       The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
-      `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0) and
-      `clip_fraction` (0..1).
+      `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
+      `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(
@@ -85,36 +89,41 @@ def ppo_loss(
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    action_mean, std, value = evaluate(params, config, minibatch)
-    log_prob = networks.log_prob(action_mean, std, minibatch.action)
+    acted, value = evaluate(params, config, minibatch)
+    log_prob = networks.log_prob(acted.mean, acted.std, minibatch.action)
     # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     metrics = {
         "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip_epsilon)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
-        "bound_loss": mean(jnp.sum(networks.beyond_range(action_mean) ** 2, axis=-1)),
-        "entropy": mean(networks.entropy(std)),
+        "bound_loss": mean(jnp.sum(networks.beyond_range(acted.mean) ** 2, axis=-1)),
+        "entropy": mean(networks.entropy(acted.std)),
         # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
         "approx_kl": mean(ratio - 1.0 - log_ratio),
         "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
+    if acted.guess is not None and minibatch.state is not None:
+        error = acted.guess - minibatch.state
+        metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return _total(metrics, config), metrics
 
 
 def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
     """Returns the sum [] of the loss's terms, weighted by their costs."""
-    return (
+    total = (
         metrics["policy_loss"]
         + config.value_cost * metrics["value_loss"]
         - config.entropy_cost * metrics["entropy"]
         + config.bound_cost * metrics["bound_loss"]
     )
+    if "guess_loss" not in metrics:
+        return total
+    assert config.guess_cost is not None  # the config has filled it in
+    return total + config.guess_cost * metrics["guess_loss"]
 
 
-def evaluate(
-    params: Params, config: AlgoConfig, minibatch: Minibatch
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def evaluate(params: Params, config: AlgoConfig, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
     """Runs actor and critic on samples; with memory, step by step.
 
     Args:
@@ -123,19 +132,22 @@ def evaluate(
       config: The config that made `params`.
 
     Returns:
-      Mean action [B, U], deviation [U] and value [B].
+      Output of the actor, without its memory, and value [B].
     """
     seen, memory = minibatch.observation, minibatch.memory
     judged = networks.critic_input(seen, minibatch.state)
     if memory is None or minibatch.begins is None:
-        mean, std = networks.action_distribution(params, config, seen)
-        return mean, std, networks.value(params, config, judged)
+        acted = networks.run_actor(params, config, seen, None)
+        return acted, networks.value(params, config, judged)
     sequences = memory.actor.shape[0]
     begins = minibatch.begins.reshape(-1, sequences)
     seen, judged = (x.reshape(-1, sequences, x.shape[-1]) for x in (seen, judged))
-    mean, std, _ = networks.recall_action(params, config, seen, memory.actor, begins)
+    acted = networks.run_actor(params, config, seen, memory.actor, begins)
     value, _ = networks.recall_value(params, config, judged, memory.critic, begins)
-    return mean.reshape(-1, mean.shape[-1]), std, value.reshape(-1)
+    mean, guess = (
+        None if x is None else x.reshape(-1, x.shape[-1]) for x in (acted.mean, acted.guess)
+    )
+    return acted._replace(mean=mean, memory=None, guess=guess), value.reshape(-1)
 
 
 def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:

@@ -85,11 +85,31 @@ class _Head(nn.Module):
         return bias + (found if recalled is None else found + recalled @ kernel[seen:])
 
 
+class Acted(NamedTuple):
+    """Output of the actor.
+
+    Attributes:
+      mean: [B, U], mean action.
+      std: [U], standard deviation of the action.
+      memory: [B, H], memory after; None without memory.
+      guess: [B, P], guess of the state that the critic sees; None if the critic sees no state.
+    """
+
+    mean: jax.Array
+    std: jax.Array
+    memory: jax.Array | None
+    guess: jax.Array | None
+
+
 class _Actor(nn.Module):
-    """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action."""
+    """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action.
+
+    If `state_size` is not 0, it also guesses the state that the critic sees (`guess`).
+    """
 
     config: AlgoConfig
     action_size: int
+    state_size: int = 0
 
     @nn.compact
     def __call__(
@@ -97,19 +117,22 @@ class _Actor(nn.Module):
         observation: jax.Array,
         memory: jax.Array | None = None,
         begins: jax.Array | None = None,
-    ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    ) -> Acted:
         features = _torso(self.config)(_hear(self.config, observation))
-        recalled = None
+        recalled, guess = None, None
         if memory is not None:
             recalled, memory = _gru(self.config)(features, memory, begins)
         head = _Head(self.config, self.action_size, name="mean")
+        if self.state_size:
+            guess = _Head(self.config, self.state_size, name="guess")(features, recalled)
         log_std = self.param(
             "log_std",
             nn.initializers.constant(math.log(self.config.initial_std)),
             (self.action_size,),
             jnp.float32,
         )
-        return _OUTPUTS[self.config.mean_activation](head(features, recalled)), log_std, memory
+        mean = _OUTPUTS[self.config.mean_activation](head(features, recalled))
+        return Acted(mean, jnp.exp(log_std), memory, guess)
 
 
 class _Critic(nn.Module):
@@ -208,14 +231,14 @@ def init_params(
       `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
       {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
       [out]. With `config.memory`, each network also has `{"memory": {"input": .., "recurrent":
-      ..}}`.
+      ..}}`. If the critic sees the state, the actor also has `{"guess": ..}`.
     """
     actor_key, critic_key = jax.random.split(key)
     seen, judged = (jnp.zeros(n) for n in (observation_size, observation_size + state_size))
     memory = begin_memory(config, ())
     mine, theirs = (None, None) if memory is None else memory
     return {
-        "actor": _Actor(config, action_size).init(actor_key, seen, mine)["params"],
+        "actor": _Actor(config, action_size, state_size).init(actor_key, seen, mine)["params"],
         "critic": _Critic(config).init(critic_key, judged, theirs)["params"],
     }
 
@@ -287,13 +310,32 @@ def recall_action(
     Returns:
       Mean and standard deviation as in `action_distribution`, and the memory [B, H] after.
     """
-    _check_input(params["actor"], observation, config)
-    actor = _Actor(config, params["actor"]["log_std"].shape[-1])
-    output = actor.apply({"params": params["actor"]}, observation, memory, begins)
-    mean, log_std, after = cast("tuple[jax.Array, jax.Array, jax.Array | None]", output)
+    return run_actor(params, config, observation, memory, begins)[:3]
+
+
+def run_actor(
+    params: Params,
+    config: AlgoConfig,
+    observation: jax.Array,
+    memory: jax.Array | None,
+    begins: jax.Array | None = None,
+) -> Acted:
+    """Runs the actor; arguments as in `recall_action`.
+
+    Returns:
+      What `recall_action` returns, and a guess of the state that the critic sees. The guess is not
+      used for acting. Its error trains the memory to hold what a robot can know about its
+      surroundings (Mirowski et al. 2017, "Learning to Navigate in Complex Environments", section
+      3).
+    """
+    mine = params["actor"]
+    _check_input(mine, observation, config)
+    sizes = mine["log_std"].shape[-1], mine["guess"]["bias"].shape[-1] if "guess" in mine else 0
+    output = _Actor(config, *sizes).apply({"params": mine}, observation, memory, begins)
+    acted = cast("Acted", output)
     if config.exploration == "scheduled":
-        log_std = jax.lax.stop_gradient(log_std)
-    return mean, jnp.exp(log_std), after
+        acted = acted._replace(std=jax.lax.stop_gradient(acted.std))
+    return acted
 
 
 def recall_value(

@@ -37,7 +37,7 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
     actor = {
         _array_name(name.removeprefix(prefix)): leaf
         for name, leaf in leaves.items()
-        if name.startswith(prefix)
+        if name.startswith(prefix) and not name.startswith(prefix + "guess/")  # only for training
     }
     mean, variance = (leaves[f"learners/normalizer/{name}"] for name in ("mean", "variance"))
     std = np.maximum(np.sqrt(variance), normalizer.MIN_STD)

@@ -152,3 +152,31 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
             CONFIG,
             jnp.float32(1.0),
         )
+
+
+def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
+    size, cost = 5, 0.3
+    config = replace(CONFIG, critic="state", guess_cost=cost)
+    params = networks.init_params(jax.random.key(0), config, OBSERVATION, U, size)
+    state = np.random.default_rng(1).normal(size=(B, size)).astype(np.float32)
+    minibatch = replace(_minibatch(), state=state)
+    count = jnp.float32(14.0)
+    loss, metrics = ppo_loss(params, minibatch, config, count)
+    free, _ = ppo_loss(params, minibatch, replace(config, guess_cost=0.0), count)
+    layers = {name: np.asarray(x, np.float64) for name, x in _flat(params["actor"]).items()}
+    hidden = np.tanh(
+        minibatch.observation @ layers["torso/hidden_0/kernel"] + layers["torso/hidden_0/bias"]
+    )
+    error = hidden @ layers["guess/kernel"] + layers["guess/bias"] - state
+    expected = (error[minibatch.valid] ** 2).sum() / 14.0
+    np.testing.assert_allclose(metrics["guess_loss"], expected, rtol=1e-5)  # float32
+    np.testing.assert_allclose(loss - free, cost * expected, rtol=1e-5)
+
+
+def _flat(tree: dict, prefix: str = "") -> dict:
+    """Returns the leaves of nested dicts by their paths."""
+    parts = {}
+    for name, leaf in tree.items():
+        path = prefix + name
+        parts |= _flat(leaf, path + "/") if isinstance(leaf, dict) else {path: leaf}
+    return parts

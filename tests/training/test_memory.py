@@ -77,7 +77,7 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     # The arenas are in another order, as in minibatches.
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
-    mean, std, value = losses.evaluate(_one(learners).params, config, minibatch)
+    (mean, std, *_), value = losses.evaluate(_one(learners).params, config, minibatch)
     log_prob = networks.log_prob(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
