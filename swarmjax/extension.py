@@ -80,7 +80,7 @@ class Observation(Piece):
     kind: ClassVar[str] = "observation"
     taken: ClassVar[tuple[str, ...]] = (
         *("infrared", "target_distance"),
-        *("target_bearing", "heading_cos", "heading_sin"),
+        *("target_bearing", "target_bearing_cos", "target_bearing_sin"),
     )
 
     size: int

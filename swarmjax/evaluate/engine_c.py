@@ -521,9 +521,9 @@ def look(
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      The sensors' view: rays, the target's distance and bearing, and the heading.
+      The sensors' view: rays, and the target's distance and bearing.
     """
     mount, shades = electronics.mount(factors), electronics.reflectance(factors)
     ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)
     bright = None if shades is None else rays.brightness(judge.scene, shades, geom)
-    return Sight(ray, bright, *observation.to_target(pose, target, np), pose[..., 2])
+    return Sight(ray, bright, *observation.to_target(pose, target, np))

@@ -29,8 +29,8 @@ QUANTITIES = (
     *(f"infrared_{i}" for i in range(8)),
     "target_distance",
     "target_bearing",
-    "heading_cos",
-    "heading_sin",
+    "target_bearing_cos",
+    "target_bearing_sin",
 )
 MOTORS = ("left wheel motor", "right wheel motor")
 
@@ -41,20 +41,6 @@ class Orders(NamedTuple):
     target: tuple[float, float] | None = None
     robot: int = 0
     sampled: bool = True
-
-
-class Place(NamedTuple):
-    """Where a robot is, as its GPS and its compass tell.
-
-    Attributes:
-      distance: distance to the target, m.
-      bearing: direction of the target from the robot's x axis, rad, -pi to pi, left positive.
-      heading: direction of the robot's x axis in the world, rad, left positive.
-    """
-
-    distance: float
-    bearing: float
-    heading: float
 
 
 def parse(words: Iterable[str]) -> Orders:
@@ -95,7 +81,8 @@ def observe(
     trained: Policy,
     sensors: dict[str, Any],
     counts: Sequence[float],
-    place: Place,
+    distance: float,
+    bearing: float,
 ) -> np.ndarray:
     """Assembles an observation.
 
@@ -103,7 +90,8 @@ def observe(
       trained: the policy.
       sensors: contents of `sensors.json`.
       counts: [K] counts of the infrared sensors.
-      place: target and heading of the robot.
+      distance: distance to the target, m.
+      bearing: direction of the target from the robot's x axis, rad, left positive.
 
     Returns:
       [O] float32, scaled by the policy's layout.
@@ -116,9 +104,8 @@ def observe(
             seen = np.minimum(seen, trained.meta["sensors"]["range"])
         else:
             seen = np.interp(seen, sensors["distance"], sensors["counts"])
-    heading = [math.cos(place.heading), math.sin(place.heading)]
-    found = [*seen, place.distance, place.bearing, *heading]
-    measured = dict(zip(QUANTITIES, found, strict=True))
+    target = [distance, bearing, math.cos(bearing), math.sin(bearing)]
+    measured = dict(zip(QUANTITIES, [*seen, *target], strict=True))
     quantity = np.array([measured[name] for name in layout["names"]], np.float32)
     offset, scale = (np.array(layout[key], np.float32) for key in ("offset", "scale"))
     return (quantity - offset) / scale
@@ -145,8 +132,8 @@ def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
 
 def to_target(
     position: Sequence[float], north: Sequence[float], target: tuple[float, float]
-) -> Place:
-    """Computes the distance and the bearing of a target from a robot, and the robot's heading.
+) -> tuple[float, float]:
+    """Computes the distance and the bearing of a target from a robot.
 
     Args:
       position: position of the robot from its GPS, x and y first, m.
@@ -155,12 +142,12 @@ def to_target(
       target: x and y, m.
 
     Returns:
-      The place.
+      Distance, m, and bearing from the robot's x axis, rad, -pi to pi, left positive.
     """
     x, y = target[0] - position[0], target[1] - position[1]
     yaw = math.atan2(north[0], north[1])
     turn = math.atan2(y, x) - yaw
-    return Place(math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn)), yaw)
+    return math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn))
 
 
 def begin(trained: Policy, robot: int) -> np.ndarray | None:
@@ -296,13 +283,15 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
         if (orders.target, orders.robot) != pursued:  # an episode begins
             memory, pursued = begin(trained, orders.robot), (orders.target, orders.robot)
         if orders.target is not None and orders.target != parked_at:
-            place = to_target(devices.gps.getValues(), devices.compass.getValues(), orders.target)
+            distance, bearing = to_target(
+                devices.gps.getValues(), devices.compass.getValues(), orders.target
+            )
             counts = [sensor.getValue() for sensor in devices.infrared]
             # An arrived robot stays where it is, as in training.
-            if stops and place.distance <= trained.meta["task"]["target_radius"]:
+            if stops and distance <= trained.meta["task"]["target_radius"]:
                 parked_at = orders.target
             else:
-                seen = observe(trained, sensors, counts, place)
+                seen = observe(trained, sensors, counts, distance, bearing)
                 normal = draw.standard_normal(len(MOTORS), np.float32) if orders.sampled else 0.0
                 wheels, memory = wheel_speeds(trained, seen, orders.robot, normal, memory)
         for motor, speed in zip(devices.motors, wheels, strict=True):

@@ -90,7 +90,6 @@ class Sight(NamedTuple):
       reflectance: [..., R, K] reflectance of the surface that each ray hits; None for 1.
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
-      heading: [..., R] direction of the robot's x axis in the arena, rad.
       own: [..., R, E] observations of an extension; None without any.
       heard: neighbours within reach; None without neighbour messages.
     """
@@ -99,7 +98,6 @@ class Sight(NamedTuple):
     reflectance: Array | None
     distance: Array
     bearing: Array
-    heading: Array
     own: Array | None = None
     heard: Heard | None = None
 
@@ -297,12 +295,12 @@ def _read(
 ) -> Readings:
     """Takes readings of all sensors."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
-    found = _find_target(electronics.realism, factors, sight, clock, xp)
+    distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
     heard = None
     if sight.heard is not None:
         told = (electronics.neighbours, electronics.realism, factors.seed)
         heard = hearing.listen(sight.heard, *told, clock, xp)
-    return Readings(sample, *found, sight.own, heard)
+    return Readings(sample, distance, bearing, sight.own, heard)
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
@@ -348,19 +346,15 @@ def _read_counts(
 
 def _find_target(
     realism: RealismConfig, factors: Factors, sight: Sight, clock: Array, xp: Any
-) -> tuple[Array, Array, Array]:
-    """Returns distance and bearing of the targets and the robots' headings, [..., R] each.
-
-    An overhead camera measures them. Its error in a bearing is an error in the heading.
-    """
-    distance, bearing, heading = sight.distance, sight.bearing, sight.heading
+) -> tuple[Array, Array]:
+    """Returns distance and bearing [..., R] of the targets, as an overhead camera sees them."""
+    distance, bearing = sight.distance, sight.bearing
     robots = distance.shape[-1:]
     if realism.target_distance_noise is not None:
         drawn = noise.normal(factors.seed, clock, Stream.TARGET_DISTANCE, robots, xp)
         distance = xp.maximum(distance + realism.target_distance_noise * drawn, 0.0)
     if realism.target_bearing_noise is not None:
         drawn = noise.normal(factors.seed, clock, Stream.TARGET_BEARING, robots, xp)
-        error = realism.target_bearing_noise * drawn
-        turned, heading = bearing + error, heading - error
+        turned = bearing + realism.target_bearing_noise * drawn
         bearing = xp.arctan2(xp.sin(turned), xp.cos(turned))
-    return distance, bearing, heading
+    return distance, bearing

@@ -429,7 +429,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return _hear(world, Sight(ray, bright, distance, bearing, pose[:, 2]), pose, level, said)
+    return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
 
 
 def _look_by_extension(

@@ -18,7 +18,7 @@ from swarmjax.extension import Observation
 from swarmjax.task.config import NeighboursConfig
 
 Array = Any
-Encoding = Literal["metric", "compass", "webots"]
+Encoding = Literal["metric", "vector", "webots"]
 SENSORS = epuck.SENSORS
 
 
@@ -29,7 +29,6 @@ class Readings(NamedTuple):
       infrared: [..., K] m or counts, depending on the encoding.
       distance: [...] distance to the target, m.
       bearing: [...] bearing of the target, rad.
-      heading: [...] direction of the robot's x axis in the arena, rad.
       own: [..., E] observations of an extension; None without any.
       heard: [..., K W] nearest neighbours; None without neighbour messages.
     """
@@ -37,7 +36,6 @@ class Readings(NamedTuple):
     infrared: Array
     distance: Array
     bearing: Array
-    heading: Array
     own: Array | None = None
     heard: Array | None = None
 
@@ -67,36 +65,32 @@ class Input(NamedTuple):
 # The paper says ten inputs and names nine. The tenth is the bearing, as in the published example
 # that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a).
 # The scaled values are counts / 1023 without clipping, distance / 1.5 m, and (bearing + pi) / (2
-# pi), so a scaled bearing of 0.5 is dead ahead. The heading is two numbers, because an angle would
-# jump from pi to -pi wherever the robot turns through west.
+# pi), so a scaled bearing of 0.5 is dead ahead. An angle jumps from pi to -pi when the target is
+# straight behind the robot. The two numbers of `vector` do not jump.
 INPUTS = (
     Input(
         tuple(f"infrared_{i}" for i in range(SENSORS)),
         lambda readings, xp: readings.infrared,
         {
             "metric": Coding("m"),
-            "compass": Coding("m"),
+            "vector": Coding("m"),
             "webots": Coding("counts", scale=1023.0),
         },
     ),
     Input(
         ("target_distance",),
         lambda readings, xp: readings.distance[..., None],
-        {"metric": Coding("m"), "compass": Coding("m"), "webots": Coding("m", scale=1.5)},
+        {"metric": Coding("m"), "vector": Coding("m"), "webots": Coding("m", scale=1.5)},
     ),
     Input(
         ("target_bearing",),
         lambda readings, xp: readings.bearing[..., None],
-        {
-            "metric": Coding("rad"),
-            "compass": Coding("rad"),
-            "webots": Coding("rad", -math.pi, 2.0 * math.pi),
-        },
+        {"metric": Coding("rad"), "webots": Coding("rad", -math.pi, 2.0 * math.pi)},
     ),
     Input(
-        ("heading_cos", "heading_sin"),
-        lambda readings, xp: xp.stack([xp.cos(readings.heading), xp.sin(readings.heading)], -1),
-        {"compass": Coding("1")},
+        ("target_bearing_cos", "target_bearing_sin"),
+        lambda readings, xp: xp.stack([xp.cos(readings.bearing), xp.sin(readings.bearing)], -1),
+        {"vector": Coding("1")},
     ),
 )
 

@@ -29,7 +29,7 @@ from swarmjax.task.config import TaskConfig
 
 NAMES = policies.measured("metric")
 METRIC, WEBOTS = policies.observed("metric", NAMES), policies.observed("webots", NAMES)
-COMPASS = policies.observed("compass", policies.measured("compass"))
+VECTOR = policies.observed("vector", policies.measured("vector"))
 
 # A stand-in for Webots' package, written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],
@@ -179,7 +179,7 @@ def _chain(
     realism = RealismConfig(infrared=answers)
     electronics = task_electronics.load(TaskConfig(), realism, encoding=trained.encoding)
     distance, bearing = observation.to_target(pose, np.array([target], np.float32), np)
-    sight = task_electronics.Sight(ray, None, distance, bearing, pose[..., 2])
+    sight = task_electronics.Sight(ray, None, distance, bearing)
     none = factors.Factors(**dict.fromkeys(factors.Factors._fields))
     _, seen = task_electronics.begin(electronics, none, sight, np.zeros(len(scenes)), np)
     names = observation.LAYOUTS[trained.encoding].names
@@ -191,7 +191,7 @@ def _chain(
 
 
 @pytest.mark.parametrize("answers", ["webots", "real"])
-@pytest.mark.parametrize("layout", [METRIC, COMPASS, WEBOTS], ids=["metric", "compass", "webots"])
+@pytest.mark.parametrize("layout", [METRIC, VECTOR, WEBOTS], ids=["metric", "vector", "webots"])
 @pytest.mark.parametrize("learners", [1, 3])
 def test_the_wheels_turn_as_they_do_in_the_judge(
     learners: int, layout: dict[str, Any], answers: Literal["webots", "real"], tmp_path: Path

@@ -27,7 +27,7 @@ from swarmjax.task.factors import Factors
 MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 ENCODINGS = pytest.mark.parametrize("encoding", ["metric", "webots"])
 RESPONSES = pytest.mark.parametrize("kind", ["ideal", "webots", "real"])
-Encoding = Literal["metric", "compass", "webots"]
+Encoding = Literal["metric", "webots"]
 Kind = Literal["ideal", "webots", "real"]
 ARENAS, ROBOTS, SENSORS = 2, 3, 8
 STEP, RANGE, RISE = 0.032, 0.04, math.cos(0.16)  # s; m; horizontal part of a ray of 1 m
@@ -62,7 +62,6 @@ def _sight(
     ray: Any = 1.0,
     distance: Any = 0.3,
     bearing: Any = math.pi / 2,
-    heading: Any = 0.5,
     reflectance: Any = None,
     arenas: int = ARENAS,
 ) -> Sight:
@@ -72,7 +71,7 @@ def _sight(
         return xp.asarray(np.broadcast_to(np.float32(value), (arenas, ROBOTS, *axes)))
 
     bright = None if reflectance is None else full(reflectance, SENSORS)
-    return Sight(full(ray, SENSORS), bright, full(distance), full(bearing), full(heading))
+    return Sight(full(ray, SENSORS), bright, full(distance), full(bearing))
 
 
 def _clock(xp: ModuleType, clock: int) -> Any:
@@ -294,7 +293,7 @@ def _due(clock: Any, period: Any, xp: Any) -> Any:
     count, robots = period.shape
     electronics = _electronics(infrared_period=(0.01, 0.05))
     none = xp.zeros((count, robots, SENSORS), xp.float32)
-    sight = Sight(none + 0.02, None, *3 * (none[..., 0],))
+    sight = Sight(none + 0.02, None, none[..., 0], none[..., 0])
     found, memory = Factors(infrared_period=period), Memory(None, none, None)
     _, seen = task_electronics.sense(electronics, memory, found, sight, clock, xp)
     return seen[..., INFRARED.start] > 0.0
@@ -421,18 +420,6 @@ def test_noise_of_the_target_is_drawn_at_every_control_step(xp: ModuleType) -> N
 
 
 @MODULES
-def test_the_error_of_a_bearing_is_an_error_of_the_heading(xp: ModuleType) -> None:
-    electronics = _electronics("compass", target_bearing_noise=0.1)
-    found, sight = _factors(xp, seed=SEED), _sight(xp, bearing=0.4, heading=0.5)
-    memory, _ = task_electronics.begin(electronics, found, sight, _clock(xp, 0), xp)
-    _, seen = task_electronics.sense(electronics, memory, found, sight, _clock(xp, 9), xp)
-    error = np.array(seen[..., BEARING]) - 0.4
-    assert (np.abs(error) > 1e-3).all()
-    heading = np.arctan2(seen[..., -1], seen[..., -2])
-    np.testing.assert_allclose(heading, 0.5 - error, atol=1e-6)  # float32
-
-
-@MODULES
 def test_a_bearing_stays_an_angle(xp: ModuleType) -> None:
     seen = _targets(xp, 0.5, math.pi, target_bearing_noise=0.5)[..., 1].astype(float)
     assert abs(seen).max() <= np.float32(math.pi)
@@ -544,7 +531,7 @@ def _live(
     nothing = xp.zeros((*clock.shape, ROBOTS), xp.float32)
     n = clock[..., None] + nothing
     ray = (0.025 + 0.01 * xp.sin(0.3 * n))[..., None] + xp.zeros(SENSORS, xp.float32)
-    sight = Sight(ray, 0.0 * ray + 0.6, 0.5 - 0.01 * n, 0.2 * n, 0.1 * n)
+    sight = Sight(ray, 0.0 * ray + 0.6, 0.5 - 0.01 * n, 0.2 * n)
     if memory is None:
         memory, seen = task_electronics.begin(electronics, found, sight, clock, xp)
     else:

@@ -265,9 +265,7 @@ def test_observation_is_of_the_state_after_the_step_before_any_reset(episode: Ep
             side, box, target = level.side[0, a], level.obstacle[0, a], level.target[0, a]
             seen = infrared.distances(pose, side, box, HULL, RANGE, np)
             distance, bearing = observation.to_target(pose, target, np)
-            expected = observation.observe(
-                Readings(seen, distance, bearing, pose[..., 2]), METRIC, np
-            )
+            expected = observation.observe(Readings(seen, distance, bearing), METRIC, np)
             found = episode.came.observation[t, a]
             # 1e-5 m covers float32 rounding, which a glancing ray multiplies.
             rest = KNOWN[KNOWN != BEARING]

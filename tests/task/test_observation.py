@@ -2,7 +2,6 @@
 
 import json
 from types import ModuleType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,22 +16,16 @@ MODULES = pytest.mark.parametrize("xp", [np, jnp])
 PI = np.pi
 
 
-def _readings(
-    xp: ModuleType, infrared: Any, distance: Any, bearing: Any, heading: Any = 0.0
-) -> Readings:
-    parts = (np.array(part, np.float32) for part in (infrared, distance, bearing, heading))
-    return Readings(*(xp.asarray(part) for part in parts))
-
-
 def test_layout() -> None:
     infrared = [f"infrared_{i}" for i in range(8)]
     assert list(observation.NAMES) == [*infrared, "target_distance", "target_bearing"]
     assert observation.LAYOUTS["metric"].units == ("m",) * 9 + ("rad",)
     assert observation.LAYOUTS["webots"].units == ("counts",) * 8 + ("m", "rad")
     assert observation.SIZE == 10
-    compass = observation.LAYOUTS["compass"]
-    assert compass.names == (*observation.NAMES, "heading_cos", "heading_sin")
-    assert compass.units == ("m",) * 9 + ("rad", "1", "1")
+    vector = observation.LAYOUTS["vector"]
+    direction = ["target_bearing_cos", "target_bearing_sin"]
+    assert list(vector.names) == [*infrared, "target_distance", *direction]
+    assert vector.units == ("m",) * 9 + ("1", "1")
 
 
 def test_description_is_plain_data_that_says_everything() -> None:
@@ -113,7 +106,7 @@ def test_bearing_lies_within_half_a_turn(yaw: float, angle: float, distance: flo
 def test_order(xp: ModuleType) -> None:
     rays = 0.001 * np.arange(16).reshape(2, 8)
     found = observation.observe(
-        _readings(xp, rays, [0.5, 0.6], [-1.0, 2.0]),
+        Readings(xp.asarray(rays), xp.asarray([0.5, 0.6]), xp.asarray([-1.0, 2.0])),
         observation.LAYOUTS["metric"],
         xp,
     )
@@ -123,30 +116,29 @@ def test_order(xp: ModuleType) -> None:
 
 
 @MODULES
-def test_a_heading_does_not_jump_in_the_west(xp: ModuleType) -> None:
-    heading = np.array([0.0, 0.5 * PI, PI - 1e-4, 1e-4 - PI, 6 * PI])
+def test_a_direction_does_not_jump_behind_the_robot(xp: ModuleType) -> None:
+    bearing = np.array([0.0, 0.5 * PI, PI - 1e-4, 1e-4 - PI])
     found = observation.observe(
-        _readings(xp, np.zeros((5, 8)), np.full(5, 0.5), np.full(5, -1.0), heading),
-        observation.LAYOUTS["compass"],
+        Readings(xp.zeros((4, 8)), xp.full((4,), 0.5), xp.asarray(bearing)),
+        observation.LAYOUTS["vector"],
         xp,
     )
-    expected = [[1.0, 0.0], [0.0, 1.0], [-1.0, 1e-4], [-1.0, -1e-4], [1.0, 0.0]]
-    # 3e-6 covers float32 of a heading of 6 pi.
-    np.testing.assert_allclose(found[:, -2:], expected, atol=3e-6)
-    np.testing.assert_array_equal(found[:, 8:10], np.float32([[0.5, -1.0]] * 5))
+    expected = [[1.0, 0.0], [0.0, 1.0], [-1.0, 1e-4], [-1.0, -1e-4]]
+    np.testing.assert_allclose(found[:, -2:], expected, atol=3e-7)  # float32 of a bearing near pi
+    np.testing.assert_array_equal(found[:, 8], np.float32(0.5))
 
 
 @MODULES
 def test_scale_of_the_published_example(xp: ModuleType) -> None:
     # Entries are counts / 1023, distance / 1.5 m, and a bearing, 0.5 dead ahead and 1 at +pi.
     found = observation.observe(
-        _readings(xp, [[1023.0] * 7 + [67.19]], [0.75], [0.5 * PI]),
+        Readings(xp.asarray([[1023.0] * 7 + [67.19]]), xp.asarray([0.75]), xp.asarray([0.5 * PI])),
         observation.LAYOUTS["webots"],
         xp,
     )
     expected = [[*[1.0] * 7, 67.19 / 1023.0, 0.5, 0.75]]
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # float32
     ahead = observation.observe(
-        _readings(xp, np.zeros(8), 0.0, 0.0), observation.LAYOUTS["webots"], xp
+        Readings(xp.zeros(8), xp.zeros(()), xp.zeros(())), observation.LAYOUTS["webots"], xp
     )
     np.testing.assert_allclose(ahead, [0.0] * 9 + [0.5], atol=1e-7)  # float32
