@@ -78,10 +78,7 @@ class Observation(Piece):
     """
 
     kind: ClassVar[str] = "observation"
-    taken: ClassVar[tuple[str, ...]] = (
-        *("infrared", "target_distance"),
-        *("target_bearing", "target_bearing_cos", "target_bearing_sin"),
-    )
+    taken: ClassVar[tuple[str, ...]] = ("infrared", "target_distance", "target_bearing")
 
     size: int
     unit: str

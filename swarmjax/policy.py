@@ -37,7 +37,7 @@ class Policy(NamedTuple):
     mean: np.ndarray  # [L, k O], mean of the observations, newest first; k is `history`
     std: np.ndarray  # [L, k O], their deviation
     is_shared: bool
-    encoding: Any  # "metric", "vector" or "webots"
+    encoding: Any  # "metric" or "webots"
     max_speed: float  # m/s; commands begin at 0
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]

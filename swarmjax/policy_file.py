@@ -34,7 +34,7 @@ from swarmjax.policy_network import PolicyNetwork
 
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
-ENCODINGS = ("metric", "vector", "webots")
+ENCODINGS = ("metric", "webots")
 ACTIVATIONS = ("tanh", "relu", "swish")
 BODIES = ("planar", "wheeled")
 RESPONSES = ("ideal", "webots", "real")

@@ -168,15 +168,9 @@ def saved(path: Path, given: Arrays | None = None, **changes: Any) -> Policy:
     return policy_file.read(path)
 
 
-def measured(encoding: observation.Encoding) -> Names:
-    """Returns the entries of an observation that the Webots controller can measure."""
-    known = webots_controller.QUANTITIES
-    return tuple(name for name in observation.LAYOUTS[encoding].names if name in known)
-
-
 def saved_for_webots(path: Path) -> Policy:
     """Writes and reads a policy that observes only what the Webots controller can measure."""
-    names = measured("metric")
+    names = webots_controller.QUANTITIES
     return saved(path, arrays(names=names), observation=observed(names=names))
 
 

@@ -132,8 +132,7 @@ def test_what_is_no_piece_is_refused() -> None:
 def test_names_of_the_package_are_taken() -> None:
     assert set(extension.RewardTerm.taken) == set(reward.TERMS)
     assert extension.LevelDrawing.taken == stage_config.BUILT_IN
-    layouts = observation.LAYOUTS.values()
-    inputs = {re.sub(r"_\d+$", "", name) for layout in layouts for name in layout.names}
+    inputs = {re.sub(r"_\d+$", "", name) for name in observation.NAMES}
     assert set(extension.Observation.taken) == inputs
 
 

@@ -243,7 +243,7 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             _part("observation", encoding="feet"),
-            r'meta.observation.encoding is "feet": expected metric or vector or webots',
+            r'meta.observation.encoding is "feet": expected metric or webots',
         ),
         (
             _GOOD,

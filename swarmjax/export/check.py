@@ -47,7 +47,7 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
 def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
     """Checks that the policy's infrared reaches no further than the sensors measure distances."""
     reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
-    if meta["observation"]["encoding"] != "webots" and reach > farthest:
+    if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(
             f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
             f"sensors={sensors} measure distances only to {farthest:g} m: train with "

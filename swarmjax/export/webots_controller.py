@@ -25,13 +25,7 @@ from swarmjax.policy import Policy
 
 INFRARED = tuple(f"ps{i}" for i in range(8))
 # Quantities that the controller can measure; an observation may have them in any order.
-QUANTITIES = (
-    *(f"infrared_{i}" for i in range(8)),
-    "target_distance",
-    "target_bearing",
-    "target_bearing_cos",
-    "target_bearing_sin",
-)
+QUANTITIES = (*(f"infrared_{i}" for i in range(8)), "target_distance", "target_bearing")
 MOTORS = ("left wheel motor", "right wheel motor")
 
 
@@ -100,12 +94,11 @@ def observe(
     seen = np.asarray(counts, float)
     if trained.encoding != sensors["answers"]:
         seen = ray(seen, sensors)
-        if trained.encoding != "webots":
+        if trained.encoding == "metric":
             seen = np.minimum(seen, trained.meta["sensors"]["range"])
         else:
             seen = np.interp(seen, sensors["distance"], sensors["counts"])
-    target = [distance, bearing, math.cos(bearing), math.sin(bearing)]
-    measured = dict(zip(QUANTITIES, [*seen, *target], strict=True))
+    measured = dict(zip(QUANTITIES, [*seen, distance, bearing], strict=True))
     quantity = np.array([measured[name] for name in layout["names"]], np.float32)
     offset, scale = (np.array(layout[key], np.float32) for key in ("offset", "scale"))
     return (quantity - offset) / scale

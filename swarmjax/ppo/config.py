@@ -12,7 +12,6 @@ from swarmjax.extension import Network
 _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
     "gae_lambda": ("advantage", "gae", 0.95),
     "memory_size": ("memory", "gru", 64),
-    "memory_span": ("memory", "gru", 2),
     "guess_cost": ("critic", "state", 0.02),
     "std_decrement": ("exploration", "scheduled", 0.05),
     "std_interval": ("exploration", "scheduled", 250_000),
@@ -80,15 +79,6 @@ class AlgoConfig(Section):
     memory_size: int | None = field(
         default=None,
         metadata=about("size of the memory; null: 64 [memory=gru]", 1, 1024),
-    )
-    memory_span: int | None = field(
-        default=None,
-        metadata=about(
-            "longest time constant of an untrained memory, control steps; its numbers get time "
-            "constants from 2 up to this one; null: 2 [memory=gru]",
-            2,
-            100_000,
-        ),
     )
     memory_kernels: Any = field(
         default=None,
@@ -292,11 +282,6 @@ class AlgoConfig(Section):
                     f"{key} is {getattr(self, key)}, but memory is {self.memory}: give "
                     f"{' or '.join(only)}, or memory=none."
                 )
-        if self.memory_span != 2 and self.initialization == "uniform":
-            raise ConfigError(
-                f"memory_span is {self.memory_span}, but initialization is uniform, which draws "
-                "all biases alike: give memory_span=2 or initialization=orthogonal."
-            )
         if self.network not in (None, "mlp"):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "

@@ -46,14 +46,12 @@ class Gru(nn.Module):
       size: H.
       uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
         (`torch.nn.RNNBase.reset_parameters`).
-      span: Longest time constant of an untrained memory, control steps, at least 2.
       kernels: Module with `remember` and `remember_all`, which replace the functions of this file
         on a GPU. None means that XLA computes them.
     """
 
     size: int
     uniform: bool = False
-    span: int = 2
     kernels: Any = None
 
     @nn.compact
@@ -74,7 +72,7 @@ class Gru(nn.Module):
         """
         if self.kernels is not None and not self.is_initializing():
             return self._by_kernels(features, memory, begins)
-        seen = self._layer(_INPUT, "input", functools.partial(_keep, span=self.span))(features)
+        seen = self._layer(_INPUT, "input")(features)
         recurrent = self._layer(_recurrent, "recurrent")
         if begins is None:
             memory = remember(seen, recurrent(memory), memory)
@@ -96,27 +94,12 @@ class Gru(nn.Module):
         every = self.kernels.remember_all(layers, features, begins, memory)
         return every, every[-1]
 
-    def _layer(self, kernel: Any, name: str, bias: Any = nn.initializers.zeros) -> nn.Dense:
+    def _layer(self, kernel: Any, name: str) -> nn.Dense:
         """Makes one layer for all three gates, side by side."""
         if not self.uniform:
-            return nn.Dense(3 * self.size, kernel_init=kernel, bias_init=bias, name=name)
+            return nn.Dense(3 * self.size, kernel_init=kernel, name=name)
         within = functools.partial(uniform, bound=1.0 / math.sqrt(self.size))
         return nn.Dense(3 * self.size, kernel_init=within, bias_init=within, name=name)
-
-
-def _keep(
-    key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, span: int
-) -> jax.Array:
-    """Draws biases [3 H] that give the numbers of a memory different time constants.
-
-    A step leaves a share u of a number, its update gate, so its time constant is 1 / (1 - u) steps.
-    With a bias log(t), an untrained gate is t / (1 + t), and the time constant is 1 + t. The times
-    t are drawn from 1 to `span` - 1 ("chrono initialization", Tallec and Ollivier 2018, "Can
-    recurrent neural networks warp time?"; their gate is 1 - u).
-    """
-    size = shape[0] // 3
-    times = jax.random.uniform(key, (size,), dtype, 1.0, span - 1.0)
-    return jnp.zeros(shape, dtype).at[size : 2 * size].set(jnp.log(times))
 
 
 def uniform(

@@ -182,11 +182,9 @@ def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
 
 
 def _gru(config: AlgoConfig) -> Gru:
-    assert config.memory_span is not None  # the config has filled it in
     return Gru(
         _memory_size(config),
         uniform=config.initialization == "uniform",
-        span=config.memory_span,
         kernels=config.memory_kernels,
         name="memory",
     )

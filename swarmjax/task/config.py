@@ -118,11 +118,11 @@ class TaskConfig(Section):
     sensor_range: float = field(
         default=epuck.SENSOR_RANGE, metadata=about("infrared range, m", above=0.0, high=1.0)
     )
-    encoding: Literal["auto", "metric", "vector", "webots"] = field(
+    encoding: Literal["auto", "metric", "webots"] = field(
         default="auto",
         metadata=about(
-            "units of observations; metric: m and rad; vector: m, and the cosine and sine of the "
-            "bearing; webots: as in Webots; auto: webots with realism.infrared=webots, else metric"
+            "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
+            "realism.infrared=webots, else metric"
         ),
     )
     observations: tuple[str, ...] | None = field(
@@ -191,14 +191,11 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
             )
 
 
-def resolve_encoding(
-    task: TaskConfig, realism: RealismConfig
-) -> Literal["metric", "vector", "webots"]:
+def resolve_encoding(task: TaskConfig, realism: RealismConfig) -> Literal["metric", "webots"]:
     """Returns the encoding of observations.
 
-    `metric` observes metres and radians. `vector` observes metres, and the cosine and sine of the
-    bearing. `webots` observes counts / 1023, distance / 1.5 m and (bearing + pi) / (2 pi), as in
-    deepworlds' find_and_avoid.
+    `metric` observes metres and radians. `webots` observes counts / 1023, distance / 1.5 m and
+    (bearing + pi) / (2 pi), as in deepworlds' find_and_avoid.
     """
     if task.encoding != "auto":
         return task.encoding

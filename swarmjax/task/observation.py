@@ -18,7 +18,7 @@ from swarmjax.extension import Observation
 from swarmjax.task.config import NeighboursConfig
 
 Array = Any
-Encoding = Literal["metric", "vector", "webots"]
+Encoding = Literal["metric", "webots"]
 SENSORS = epuck.SENSORS
 
 
@@ -53,44 +53,34 @@ class Input(NamedTuple):
 
     Attributes:
       names: names of the entries.
-      read: computes the entries [..., len(names)] from the readings, with `numpy` or `jax.numpy`.
-      codings: scaling for each encoding that has these entries.
+      read: extracts the entries [..., len(names)] from the readings.
+      codings: scaling for each encoding.
     """
 
     names: tuple[str, ...]
-    read: Callable[[Readings, Any], Array]
+    read: Callable[[Readings], Array]
     codings: Mapping[Encoding, Coding]
 
 
 # The paper says ten inputs and names nine. The tenth is the bearing, as in the published example
 # that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a).
 # The scaled values are counts / 1023 without clipping, distance / 1.5 m, and (bearing + pi) / (2
-# pi), so a scaled bearing of 0.5 is dead ahead. An angle jumps from pi to -pi when the target is
-# straight behind the robot. The two numbers of `vector` do not jump.
+# pi), so a scaled bearing of 0.5 is dead ahead.
 INPUTS = (
     Input(
         tuple(f"infrared_{i}" for i in range(SENSORS)),
-        lambda readings, xp: readings.infrared,
-        {
-            "metric": Coding("m"),
-            "vector": Coding("m"),
-            "webots": Coding("counts", scale=1023.0),
-        },
+        lambda readings: readings.infrared,
+        {"metric": Coding("m"), "webots": Coding("counts", scale=1023.0)},
     ),
     Input(
         ("target_distance",),
-        lambda readings, xp: readings.distance[..., None],
-        {"metric": Coding("m"), "vector": Coding("m"), "webots": Coding("m", scale=1.5)},
+        lambda readings: readings.distance[..., None],
+        {"metric": Coding("m"), "webots": Coding("m", scale=1.5)},
     ),
     Input(
         ("target_bearing",),
-        lambda readings, xp: readings.bearing[..., None],
+        lambda readings: readings.bearing[..., None],
         {"metric": Coding("rad"), "webots": Coding("rad", -math.pi, 2.0 * math.pi)},
-    ),
-    Input(
-        ("target_bearing_cos", "target_bearing_sin"),
-        lambda readings, xp: xp.stack([xp.cos(readings.bearing), xp.sin(readings.bearing)], -1),
-        {"vector": Coding("1")},
     ),
 )
 
@@ -131,12 +121,7 @@ def layout(
     Returns:
       The layout.
     """
-    rows = [
-        (name, *each.codings[encoding])
-        for each in INPUTS
-        if encoding in each.codings
-        for name in each.names
-    ]
+    rows = [(name, *each.codings[encoding]) for each in INPUTS for name in each.names]
     rows += [(name, each.unit, each.offset, each.scale) for each in own for name in each.names]
     rows += [] if neighbours is None else _neighbour_rows(neighbours)
     return Layout(*zip(*rows, strict=True))
@@ -238,7 +223,7 @@ def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
     Returns:
       [..., O] float32, scaled as in the layout.
     """
-    parts = [each.read(readings, xp) for each in INPUTS if each.names[0] in layout.names]
+    parts = [each.read(readings) for each in INPUTS]
     parts += [] if readings.own is None else [readings.own]
     parts += [] if readings.heard is None else [readings.heard]
     entries = xp.concatenate(parts, axis=-1).astype(xp.float32)

@@ -27,9 +27,8 @@ from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors, observation
 from swarmjax.task.config import TaskConfig
 
-NAMES = policies.measured("metric")
+NAMES = webots_controller.QUANTITIES  # measured by the controller, observed by these policies
 METRIC, WEBOTS = policies.observed("metric", NAMES), policies.observed("webots", NAMES)
-VECTOR = policies.observed("vector", policies.measured("vector"))
 
 # A stand-in for Webots' package, written from the manual's names and units. It plays a script,
 # {"basic": ms, "custom": text, "missing": [names], "steps": [{"counts": [8], "gps": [3],
@@ -109,8 +108,7 @@ def _exported(tmp_path: Path, *words: str, **changes: Any) -> tuple[Policy, Path
     """Writes a policy and exports it."""
     changes = {"observation": METRIC} | changes
     learners = changes.get("learners", 1)
-    names = changes["observation"]["names"]
-    given = policies.arrays(hidden=(16, 16), learners=learners, names=names)
+    given = policies.arrays(hidden=(16, 16), learners=learners, names=NAMES)
     if changes["observation"]["encoding"] == "webots":
         given["normalizer/mean"][:] = by_name(NAMES, 0.3, distance=0.5, bearing=0.5, other=0.0)
         given["normalizer/std"][:] = by_name(NAMES, 0.3, distance=0.3, bearing=0.25, other=1.0)
@@ -182,8 +180,7 @@ def _chain(
     sight = task_electronics.Sight(ray, None, distance, bearing)
     none = factors.Factors(**dict.fromkeys(factors.Factors._fields))
     _, seen = task_electronics.begin(electronics, none, sight, np.zeros(len(scenes)), np)
-    names = observation.LAYOUTS[trained.encoding].names
-    known = [names.index(name) for name in trained.meta["observation"]["names"]]
+    known = [observation.NAMES.index(name) for name in NAMES]
     robots = np.repeat(seen[..., known], len(trained.mean), axis=1)
     robot = drive.from_config(RobotConfig())
     command = drive.command(policy.act(trained, robots), robot, np)
@@ -191,7 +188,7 @@ def _chain(
 
 
 @pytest.mark.parametrize("answers", ["webots", "real"])
-@pytest.mark.parametrize("layout", [METRIC, VECTOR, WEBOTS], ids=["metric", "vector", "webots"])
+@pytest.mark.parametrize("layout", [METRIC, WEBOTS], ids=["metric", "webots"])
 @pytest.mark.parametrize("learners", [1, 3])
 def test_the_wheels_turn_as_they_do_in_the_judge(
     learners: int, layout: dict[str, Any], answers: Literal["webots", "real"], tmp_path: Path

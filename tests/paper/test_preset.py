@@ -54,8 +54,8 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = files.read_preset("algo", "paper")
     of_gae = {"gae_lambda", "normalize_advantages"}
-    memory = {"memory_size", "memory_span"}
-    others = of_gae | memory | {"update_backend", "network"}  # for speed or extensions
+    of_others = {"memory_size", "guess_cost"}  # of a memory, and of a critic of the state
+    others = of_gae | of_others | {"update_backend", "network"}  # for speed or extensions
     keys = {f.name for f in dataclasses.fields(AlgoConfig) if not f.metadata["derived"]}
     assert set(given["algo"]) - {"name"} | others == keys
     assert PAPER.algo.gae_lambda is None

@@ -273,33 +273,6 @@ def test_a_uniform_unit_begins_within_the_bound_of_pytorch() -> None:
         assert 0.1 < np.abs(part).max() <= 1 / 8
 
 
-@pytest.mark.parametrize("span", [2, 50])
-def test_a_new_memory_holds_numbers_for_at_most_its_span(span: int) -> None:
-    """Forgets numbers without any input: after a step, a share u of each number is left."""
-    unit, size = Gru(64, span=span), 64
-    params = unit.init(jax.random.key(0), jnp.zeros(WIDTH), jnp.zeros(size))
-    bare = jax.tree.map(lambda x: x if x.ndim == 1 else jnp.zeros_like(x), params)
-    after = np.asarray(unit.apply(bare, jnp.zeros(WIDTH), jnp.ones(size))[1])
-    lasts = 1.0 / (1.0 - after)  # steps
-    # 1e-4 covers the float32 rounding of 1 - u.
-    assert lasts.min() >= 2.0 - 1e-4
-    assert lasts.max() <= span * (1.0 + 1e-4)
-    assert np.ptp(lasts) >= 0.8 * (span - 2)
-
-
-@pytest.mark.parametrize("side", ["actor", "critic"])
-def test_networks_have_memories_of_the_span(side: str) -> None:
-    config = replace(CONFIG, memory_span=50)
-    params: Any = networks.init_params(jax.random.key(0), config, WIDTH, 2)
-    bias = params[side]["memory"]["input"]["bias"]
-    assert (bias[SIZE : 2 * SIZE] > 0.0).all()
-
-
-def test_a_span_does_not_go_with_uniform_biases() -> None:
-    with pytest.raises(ConfigError, match="memory_span is 9, but initialization is uniform"):
-        AlgoConfig(memory="gru", memory_span=9, initialization="uniform")
-
-
 def test_a_memory_begins_empty() -> None:
     assert networks.begin_memory(AlgoConfig(), (2, 3)) is None
     made = networks.begin_memory(CONFIG, (2, 3))

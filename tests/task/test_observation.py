@@ -22,10 +22,6 @@ def test_layout() -> None:
     assert observation.LAYOUTS["metric"].units == ("m",) * 9 + ("rad",)
     assert observation.LAYOUTS["webots"].units == ("counts",) * 8 + ("m", "rad")
     assert observation.SIZE == 10
-    vector = observation.LAYOUTS["vector"]
-    direction = ["target_bearing_cos", "target_bearing_sin"]
-    assert list(vector.names) == [*infrared, "target_distance", *direction]
-    assert vector.units == ("m",) * 9 + ("1", "1")
 
 
 def test_description_is_plain_data_that_says_everything() -> None:
@@ -113,19 +109,6 @@ def test_order(xp: ModuleType) -> None:
     expected = np.array([[*rays[0], 0.5, -1.0], [*rays[1], 0.6, 2.0]], np.float32)
     np.testing.assert_array_equal(found, expected)
     assert found.dtype == np.float32
-
-
-@MODULES
-def test_a_direction_does_not_jump_behind_the_robot(xp: ModuleType) -> None:
-    bearing = np.array([0.0, 0.5 * PI, PI - 1e-4, 1e-4 - PI])
-    found = observation.observe(
-        Readings(xp.zeros((4, 8)), xp.full((4,), 0.5), xp.asarray(bearing)),
-        observation.LAYOUTS["vector"],
-        xp,
-    )
-    expected = [[1.0, 0.0], [0.0, 1.0], [-1.0, 1e-4], [-1.0, -1e-4]]
-    np.testing.assert_allclose(found[:, -2:], expected, atol=3e-7)  # float32 of a bearing near pi
-    np.testing.assert_array_equal(found[:, 8], np.float32(0.5))
 
 
 @MODULES

@@ -183,7 +183,6 @@ def test_substeps_are_not_given_by_default():
         ("auto", "webots", "webots"),
         ("metric", "webots", "metric"),
         ("webots", "ideal", "webots"),
-        ("vector", "webots", "vector"),
     ],
 )
 def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved):
@@ -220,8 +219,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["realism.infrared=counts"], "realism.infrared is 'counts': give ideal, webots or real."),
         (["realism.speed_quantisation=epuck"], "realism.speed_quantisation is 'epuck': give "
          "epuck1, epuck2 or null."),
-        (["task.encoding=counts"], "task.encoding is 'counts': give auto, metric, vector or "
-         "webots."),
+        (["task.encoding=counts"], "task.encoding is 'counts': give auto, metric or webots."),
         (["realism.infrared_gian=[1,1]"], "realism.infrared_gian is not a key: did you mean "
          "realism.infrared_gain?"),
         (["dead_sensor=0"], "dead_sensor is not a key: did you mean realism.dead_sensor?"),
