@@ -206,6 +206,15 @@ class AlgoConfig(Section):
         default="learned",
         metadata=about("deviation of the action: learned, or falling in steps by a schedule"),
     )
+    noise_correlation: float = field(
+        default=0.0,
+        metadata=about(
+            "correlation of the noise of an action in training with that of the control step "
+            "before; 0: independent noise",
+            0.0,
+            below=1.0,
+        ),
+    )
     initial_std: float = field(
         default=0.6,
         metadata=about("first deviation: 'starting std of action distribution'", above=0.0),
