@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
+from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
 from swarmjax.ppo import dispatch, networks
@@ -17,9 +19,10 @@ from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
+from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
-from swarmjax.task import env
+from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
 from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
@@ -260,6 +263,22 @@ def test_what_is_not_valid_may_hold_nan() -> None:
         for x in (holes, batch.state)
     )
     jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+def test_the_policy_file_acts_as_the_learner_and_holds_no_guess(
+    tiny_config: TrainConfig, tmp_path: Path
+) -> None:
+    config = replace(tiny_config, algo=_algo(tiny_config))
+    program, schedule = programs.load(config)
+    state = jax.jit(partial(loop.init, program))(schedule)
+    assert "guess" in state.learners.params["actor"]
+    leaves = {name: leaf[None] for name, leaf in to_leaves(state).items()}
+    write_policy(tmp_path / "policy.npz", leaves, config, update=0, seed=0)
+    seen = np.random.default_rng(0).normal(size=(50, observation.SIZE)).astype(np.float32)
+    learner = jax.tree.map(lambda leaf: leaf[0], state.learners)
+    found = policy.act(policy_file.read(tmp_path / "policy.npz"), seen[:, None])[:, 0]
+    # float32, sums of ten terms
+    np.testing.assert_allclose(found, ppo.mode(learner, config.algo, seen), atol=2e-6)
 
 
 # --- settings that do not go with a critic of the state
