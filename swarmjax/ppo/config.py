@@ -36,10 +36,13 @@ class AlgoConfig(Section):
     means the option's default.
     """
 
-    removed: ClassVar[Mapping[str, str]] = dict.fromkeys(
-        ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
-        "give a negative task.reward.robot_contact instead.",
-    )
+    removed: ClassVar[Mapping[str, str]] = {
+        "memory_span": "a new memory keeps a number for two control steps.",
+        **dict.fromkeys(
+            ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
+            "give a negative task.reward.robot_contact instead.",
+        ),
+    }
     renamed: ClassVar[Mapping[str, str]] = {
         "rollout": "rollout_length",
         "minibatches": "num_minibatches",
@@ -205,15 +208,6 @@ class AlgoConfig(Section):
     exploration: Literal["learned", "scheduled"] = field(
         default="learned",
         metadata=about("deviation of the action: learned, or falling in steps by a schedule"),
-    )
-    noise_correlation: float = field(
-        default=0.0,
-        metadata=about(
-            "correlation of the noise of an action in training with that of the control step "
-            "before; 0: independent noise",
-            0.0,
-            below=1.0,
-        ),
     )
     initial_std: float = field(
         default=0.6,

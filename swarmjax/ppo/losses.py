@@ -46,8 +46,8 @@ def ppo_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
-    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound + guess_cost *
-    guess.
+    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound, and guess_cost *
+    guess if the critic sees the state.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
@@ -61,8 +61,7 @@ def ppo_loss(
     deviations beyond the range, all drawn actions have the same effect, and the policy learns
     nothing from them.
 
-    The guess term exists if the critic sees the state. It is the squared error of the actor's guess
-    of the state, summed over the numbers of the state.
+    The guess term is the squared error of the actor's guess of the state, summed over its numbers.
 
     Each term is a sum over the valid samples divided by `expected_valid`. Every valid sample of a
     batch then has the same weight, even if the minibatches are filled unevenly. The mean over the

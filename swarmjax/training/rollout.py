@@ -5,7 +5,6 @@ with N the robots of an arena that one learner drives.
 """
 
 import functools
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -191,12 +190,11 @@ def collect(
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
-    judged = _judge(program, learners, arenas)
-    carry = (arenas, judged, begun, _begin_noise(program, judged, key))
+    carry = (arenas, _judge(program, learners, arenas), begun)
     steps = config.rollout_length
     keys = jax.random.split(key, steps)
     carry, (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
-    arenas, _, begun, _ = carry
+    arenas, _, begun = carry
     if under_way is not None and starts.source is not None:
         every = practices.line_up(under_way, starts.source)
         arenas = replace(arenas, source=practices.current(every, begun))
@@ -322,8 +320,7 @@ _COUNTS = {
 }
 
 _Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
-# Arenas, critics' results, episodes begun by each arena, noise of the actions before.
-_Carry = tuple[Arena, _Judged, Array, Array | None]
+_Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
 
 
 def _step(
@@ -334,12 +331,11 @@ def _step(
     now: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
     """Runs one control step of all arenas; the first step of a rollout is 1."""
-    (arenas, judged, begun, before), (key, number) = carry, now
-    count, config = judged.value.shape[0], program.config.algo
+    (arenas, judged, begun), (key, number) = carry, now
+    count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = _noise(program.shards, key, (*mine.shape[:-1], program.world.action_size))
-    if before is not None:
-        noise = before = _correlate(config.noise_correlation, before, noise)
+    config = program.config.algo
     acting = explore(program, learners, number)
     action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
@@ -363,7 +359,7 @@ def _step(
         over=None if memory is None else over,
         state=judged.state,
     )
-    carry = (arenas, _pick(over, first, reached), begun + came.done, before)
+    carry = (arenas, _pick(over, first, reached), begun + came.done)
     return carry, (transition, _to_counts(ended))
 
 
@@ -388,24 +384,6 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
     learners, arenas, *rest = shape
     size = (learners, arenas // shards.local_streams, *rest)
     return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
-
-
-def _begin_noise(program: Program, judged: _Judged, key: Array) -> Array | None:
-    """Draws the noise before a rollout, [L, A, N, U]; None if noise is independent."""
-    if not program.config.algo.noise_correlation:
-        return None
-    shape = (*judged.value.shape, program.world.action_size)
-    return _noise(program.shards, jax.random.fold_in(key, 1), shape)
-
-
-def _correlate(correlation: float, before: Array, fresh: Array) -> Array:
-    """Mixes the noise of the step before with fresh noise: an autoregressive process of order one.
-
-    Each value stays standard normal, and the density of an action is that of independent noise
-    (Hollenstein et al. 2024, "Colored Noise in PPO"). Independent noise is drawn 31 times a second
-    and averages out before a robot has turned, so the robot hardly tries another way.
-    """
-    return correlation * before + math.sqrt(1.0 - correlation**2) * fresh
 
 
 def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:

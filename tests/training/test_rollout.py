@@ -403,34 +403,6 @@ def test_actions_are_drawn_from_the_policy(tiny_config: TrainConfig, run: Run) -
     np.testing.assert_allclose(run.trajectory.log_prob[:, 0], density.sum(axis=-1), atol=1e-4)
 
 
-def test_noise_is_correlated_from_step_to_step(
-    program: Program, draw: Draw, learners: LearnerState, before: Arena
-) -> None:
-    correlation, steps = 0.9, 64
-    algo = dataclasses.replace(
-        program.config.algo, noise_correlation=correlation, rollout_length=steps
-    )
-    config = dataclasses.replace(program.config, algo=algo)
-    collect = jax.jit(
-        functools.partial(rollout.collect, dataclasses.replace(program, config=config))
-    )
-    learner = jax.tree.map(lambda x: x[0], learners)
-    drawn = []
-    for seed in range(8):
-        _, trajectory, _ = collect(learners, before, draw(1, NEXT), jax.random.key(seed))
-        mean = ppo.mode(learner, algo, trajectory.observation[:, 0])
-        noise = (trajectory.action[:, 0] - mean) / jnp.exp(learner.params["actor"]["log_std"])
-        drawn.append(np.where(trajectory.valid[:, 0, :, :, None], noise, np.nan))
-    noise = np.stack(drawn)  # [8, T, A, N, U]
-    # 384 series of 64 numbers, whose effective number is about 384 * 64 * (1 - 0.9) / (1 + 0.9) =
-    # 1,300. The standard error of a mean is 1 / sqrt(1,300) = 0.028; the tolerances are five times
-    # this error.
-    assert np.nanmean(noise) == pytest.approx(0.0, abs=0.14)
-    assert np.nanmean(noise**2) == pytest.approx(1.0, abs=0.14 * np.sqrt(2))
-    assert np.nanmean(noise[:, 1:] * noise[:, :-1]) == pytest.approx(correlation, abs=0.2)
-    assert np.nanmean(noise[:, 0] ** 2) == pytest.approx(1.0, abs=0.36)  # 384 squares, five errors
-
-
 def test_a_broken_arena_starts_afresh_and_nothing_of_it_is_learnt(run: Run) -> None:
     assert not run.trajectory.valid[0, 0, BROKEN].any()
     assert run.ended.broken[:, BROKEN].tolist() == [1] + [0] * 7
