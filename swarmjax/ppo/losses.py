@@ -46,8 +46,8 @@ def ppo_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
-    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound, and guess_cost *
-    guess if the critic sees the state.
+    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound. If the critic
+    sees the state, guess_cost * guess is added.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
