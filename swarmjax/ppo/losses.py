@@ -83,12 +83,23 @@ def ppo_loss(
     chex.assert_rank(
         [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
     )
+    metrics = _terms(*evaluate(params, config, minibatch), minibatch, config, expected_valid)
+    return _total(metrics, config), metrics
+
+
+def _terms(
+    acted: Acted,
+    value: jax.Array,
+    minibatch: Minibatch,
+    config: AlgoConfig,
+    expected_valid: jax.Array,
+) -> Metrics:
+    """Returns the terms of the loss, before they are weighted by their costs."""
     valid = minibatch.valid.astype(bool)
 
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    acted, value = evaluate(params, config, minibatch)
     log_prob = networks.log_prob(acted.mean, acted.std, minibatch.action)
     # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
@@ -105,7 +116,7 @@ def ppo_loss(
     if acted.guess is not None and minibatch.state is not None:
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
-    return _total(metrics, config), metrics
+    return metrics
 
 
 def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from flax import traverse_util
 
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
@@ -163,7 +164,8 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
     count = jnp.float32(14.0)
     loss, metrics = ppo_loss(params, minibatch, config, count)
     free, _ = ppo_loss(params, minibatch, replace(config, guess_cost=0.0), count)
-    layers = {name: np.asarray(x, np.float64) for name, x in _flat(params["actor"]).items()}
+    flat = traverse_util.flatten_dict(params["actor"], sep="/")
+    layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}
     hidden = np.tanh(
         minibatch.observation @ layers["torso/hidden_0/kernel"] + layers["torso/hidden_0/bias"]
     )
@@ -171,12 +173,3 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
     expected = (error[minibatch.valid] ** 2).sum() / 14.0
     np.testing.assert_allclose(metrics["guess_loss"], expected, rtol=1e-5)  # float32
     np.testing.assert_allclose(loss - free, cost * expected, rtol=1e-5)
-
-
-def _flat(tree: dict, prefix: str = "") -> dict:
-    """Returns the leaves of nested dicts by their paths."""
-    parts = {}
-    for name, leaf in tree.items():
-        path = prefix + name
-        parts |= _flat(leaf, path + "/") if isinstance(leaf, dict) else {path: leaf}
-    return parts
