@@ -65,6 +65,7 @@ Arm = Literal[
     "adaptive",
     "prerequisites",
     "learnability",
+    "failure",
     "value_loss",
     "mutation",
 ]
@@ -76,6 +77,7 @@ ARMS: dict[Arm, list[str]] = {
     "adaptive": _BY_FAILURE,
     "prerequisites": [*_BY_FAILURE, "curriculum.prerequisites=1"],
     "learnability": [*_EVENLY, "curriculum.levels.mode=learnability"],
+    "failure": [*_EVENLY, "curriculum.levels.mode=failure"],
     "value_loss": [*_EVENLY, "curriculum.levels.mode=value_loss"],
     "mutation": [
         *_EVENLY,

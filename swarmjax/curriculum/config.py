@@ -24,8 +24,8 @@ _MODE_OPTIONS: dict[str, tuple[tuple[str, ...], float | str | None]] = {
     "exploration": (_STEPWISE, "keep"),
     "newcomers": (_STEPWISE, "copy"),
 }
-_BUFFERED = ("learnability", "value_loss")
-
+_BUFFERED = ("learnability", "failure", "value_loss")
+_LISTED = f"{', '.join(_BUFFERED[:-1])} and {_BUFFERED[-1]}"
 
 # Options of a curriculum over levels with a buffer, and the default that null means.
 _LEVEL_OPTIONS: dict[str, float | int] = {
@@ -47,18 +47,19 @@ class LevelsConfig(Section):
     means the default.
     """
 
-    mode: Literal["random", "learnability", "value_loss"] = field(
+    mode: Literal["random", "learnability", "failure", "value_loss"] = field(
         default="random",
         metadata=about(
             "random: a new level every episode; learnability: a buffer of the levels with the "
-            "largest p (1 - p), where p is their success; value_loss: a buffer of the levels with "
-            "the largest positive value loss"
+            "largest p (1 - p), where p is their success; failure: with the largest 1 - p; "
+            "value_loss: with the largest positive value loss"
         ),
     )
     buffer: int | None = field(
         default=None,
         metadata=about(
-            "levels to keep, an equal number for each stage; null: 4096 [learnability, value_loss]",
+            "levels to keep, an equal number for each stage; null: 4096 "
+            "[learnability, failure, value_loss]",
             1,
             _MOST_LEVELS,
         ),
@@ -67,7 +68,7 @@ class LevelsConfig(Section):
         default=None,
         metadata=about(
             "share of episodes that begin on a level of a full buffer; null: 0.5 "
-            "[learnability, value_loss]",
+            "[learnability, failure, value_loss]",
             above=0.0,
             below=1.0,
         ),
@@ -76,7 +77,7 @@ class LevelsConfig(Section):
         default=None,
         metadata=about(
             "share of replayed episodes that begin on a mutated level, with one wall, box, start "
-            "or target moved; null: 0 [learnability, value_loss]",
+            "or target moved; null: 0 [learnability, failure, value_loss]",
             0.0,
             1.0,
         ),
@@ -84,7 +85,8 @@ class LevelsConfig(Section):
     temperature: float | None = field(
         default=None,
         metadata=about(
-            "replay is proportional to rank^(-1 / temperature); null: 2 [learnability, value_loss]",
+            "replay is proportional to rank^(-1 / temperature); null: 2 "
+            "[learnability, failure, value_loss]",
             0.01,
             100.0,
         ),
@@ -93,7 +95,7 @@ class LevelsConfig(Section):
         default=None,
         metadata=about(
             "share of the replay that depends on the time since a level was last played; "
-            "null: 0.1 [learnability, value_loss]",
+            "null: 0.1 [learnability, failure, value_loss]",
             0.0,
             1.0,
         ),
@@ -102,7 +104,7 @@ class LevelsConfig(Section):
         default=None,
         metadata=about(
             "episodes that a level needs before it can be mutated (the newest 16 are remembered); "
-            "null: 4 [learnability, value_loss]",
+            "null: 4 [learnability, failure, value_loss]",
             1,
             16,
         ),
@@ -124,7 +126,7 @@ class LevelsConfig(Section):
             if not self.is_on and value is not None:
                 raise ConfigError(
                     f"{key} is {show(value, quote='')}, but mode is {self.mode}, which has no "
-                    f"buffer: {key} is an option of {' and '.join(_BUFFERED)}, so give null or "
+                    f"buffer: {key} is an option of {_LISTED}, so give null or "
                     f"mode={_BUFFERED[0]}."
                 )
             if self.is_on and value is None:

@@ -266,6 +266,12 @@ def _mode(config: LevelsConfig) -> str:
     return config.mode
 
 
+def _posterior(episodes: Array, successes: Array, usual: Array) -> tuple[Array, Array]:
+    """Returns the parameters of the beta distribution of a level's success p."""
+    a = successes + _PRIOR_EPISODES * usual
+    return a, episodes - successes + _PRIOR_EPISODES * (1.0 - usual)
+
+
 def _learnability(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
     """Returns the expected p (1 - p) of a level, given its episodes alone.
 
@@ -273,9 +279,14 @@ def _learnability(episodes: Array, successes: Array, loss: Array, usual: Array) 
     result grows with the number of episodes: one episode is too little evidence to displace a level
     with p near 1/2.
     """
-    a = successes + _PRIOR_EPISODES * usual
-    b = episodes - successes + _PRIOR_EPISODES * (1.0 - usual)
+    a, b = _posterior(episodes, successes, usual)
     return a * b / ((a + b) * (a + b + 1.0))
+
+
+def _failure(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
+    """Returns the expected 1 - p of a level: b / (a + b) for a beta distribution."""
+    a, b = _posterior(episodes, successes, usual)
+    return b / (a + b)
 
 
 def _value_loss(episodes: Array, successes: Array, loss: Array, usual: Array) -> Array:
@@ -285,6 +296,7 @@ def _value_loss(episodes: Array, successes: Array, loss: Array, usual: Array) ->
 
 _SCORES: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
     "learnability": _learnability,
+    "failure": _failure,
     "value_loss": _value_loss,
 }
 

@@ -16,6 +16,7 @@ from swarmjax.curriculum.config import LevelsConfig
 from swarmjax.curriculum.levels import FRESH, LOST, MUTATED, LevelBuffer, LevelNumbers, Play
 
 LEARNABILITY = LevelsConfig(mode="learnability", buffer=12)
+FAILURE = LevelsConfig(mode="failure", buffer=12)
 VALUE_LOSS = LevelsConfig(mode="value_loss", buffer=12)
 UPDATE, CHOOSE = jax.jit(levels.update, static_argnums=2), jax.jit(levels.choose)
 MUTATE = jax.jit(levels.mutate)
@@ -90,6 +91,18 @@ def test_learnability_is_the_expected_p_times_1_minus_p_over_recorded_outcomes()
     successes = first + came[1:].sum(axis=0)
     expected = _expected_learnability(successes, 16, usual[stage])
     np.testing.assert_allclose(np.asarray(buffer.score).ravel(), expected, rtol=1e-5)  # float32
+
+
+def test_failure_is_the_expected_1_minus_p() -> None:
+    usual, first = np.array([0.8], np.float32), np.arange(12) % 2
+    buffer = levels.init(1, 12, 1)
+    buffer, _ = UPDATE(buffer, _plays([FRESH] * 12, [0] * 12, successes=first), FAILURE, usual)
+    # A second episode on each level fails.
+    buffer, _ = UPDATE(buffer, _plays(np.arange(12), [0] * 12), FAILURE, usual)
+    # Two episodes are added to a prior of two episodes that succeed in 80 % of the cases.
+    expected = np.where(buffer.successes[0] > 0, 1.4 / 4, 2.4 / 4)
+    np.testing.assert_allclose(buffer.score[0], expected, rtol=1e-6)  # float32
+    assert sorted(buffer.successes[0]) == [0] * 6 + [1] * 6
 
 
 def test_success_of_robots_is_the_share_that_arrived() -> None:
@@ -342,12 +355,12 @@ def test_a_mutation_chooses_evenly_and_moves_both_ways() -> None:
         (
             {"mutation": 0.2},
             "mutation is 0.2, but mode is random, which has no buffer: mutation is an option of "
-            "learnability and value_loss, so give null or mode=learnability.",
+            "learnability, failure and value_loss, so give null or mode=learnability.",
         ),
         (
             {"buffer": 100},
             "buffer is 100, but mode is random, which has no buffer: buffer is an option of "
-            "learnability and value_loss, so give null or mode=learnability.",
+            "learnability, failure and value_loss, so give null or mode=learnability.",
         ),
         ({"mode": "learnability", "replay": 1.5}, "replay is 1.5: give more than 0, less than 1."),
         ({"mode": "learnability", "mutation": -0.1}, "mutation is -0.1: give 0 to 1."),
