@@ -258,8 +258,11 @@ def look_around(world: World, state: EnvState) -> Array:
       [R, P], as `surroundings.look` returns it.
     """
     pose = physics.poses(world.physics, state.sim)
-    to_go = state.distance if state.path is None else state.path.distance
-    return surroundings.look(pose, state.level, state.arrived, to_go)
+    to_go, waypoint = state.distance, state.level.target
+    if state.path is not None:
+        to_go = state.path.distance
+        waypoint = geodesic.waypoint(state.path, pose[:, :2], state.level)
+    return surroundings.look(pose, state.level, state.arrived, to_go, waypoint)
 
 
 def _no_episode(robots: int) -> Episode:

@@ -90,6 +90,27 @@ def go_on(path: Path, place: Array, level: Level, hull_radius: float, fast: Any 
     return path._replace(distance=distance)
 
 
+def waypoint(path: Path, place: Array, level: Level) -> Array:
+    """Finds the first waypoint of each robot's shortest path: a corner or the target.
+
+    Args:
+      path: path state, measured from these places.
+      place: [R, 2] current places of the robots, m.
+      level: level of the episode.
+
+    Returns:
+      [R, 2] x and y, m. Without a path, it is an arbitrary corner or the target.
+    """
+    corner = jnp.broadcast_to(path.roadmap.corner, (len(place), *path.roadmap.corner.shape))
+    choices = jnp.concatenate([level.target[:, None], corner], axis=1)
+    to_go = jnp.pad(path.roadmap.to_go, ((0, 0), (1, 0)))
+    length = jnp.linalg.norm(choices - place[:, None], axis=-1) + to_go
+    # The waypoint is the choice whose path has the measured length. So lines of sight, which are
+    # costly, are not checked again.
+    chosen = jnp.argmin(jnp.abs(length - path.distance[:, None]), axis=1)
+    return jnp.take_along_axis(choices, chosen[:, None, None], axis=1)[:, 0]
+
+
 def _measured(
     roadmap: Roadmap, place: Array, level: Level, hull_radius: float, fast: Any, otherwise: Array
 ) -> Array:

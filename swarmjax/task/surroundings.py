@@ -23,15 +23,16 @@ NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
 # small and would magnify the first entries.
 REACH = 2.0
 FARTHEST = 4.0  # m; the largest distance to go that is shown, because paths wind around walls
+_NEAR = 1e-3  # m; below it, the direction to a waypoint fades
 
-_OWN = 4  # target x, y; arrived; distance to go
+_OWN = 6  # target x, y; arrived; distance to go; direction to the waypoint x, y
 _ROBOT = 8  # presence; x, y, heading x, y, target x, y, arrived
 _RECTANGLE = 8  # presence; nearest x, y, right end x, y, left end x, y, half the short edge
 
 SIZE = _OWN + NEAREST_ROBOTS * _ROBOT + NEAREST_RECTANGLES * _RECTANGLE  # entries, P
 
 
-def look(pose: Array, level: Level, arrived: Array, to_go: Array) -> Array:
+def look(pose: Array, level: Level, arrived: Array, to_go: Array, waypoint: Array) -> Array:
     """Lists the surroundings of each robot of one arena.
 
     Args:
@@ -39,17 +40,25 @@ def look(pose: Array, level: Level, arrived: Array, to_go: Array) -> Array:
       level: level of the episode.
       arrived: [R] whether the robot has arrived.
       to_go: [R] distance to the target, along the shortest path if it is known, m.
+      waypoint: [R, 2] first waypoint of this path, m; the target if the path is not known.
 
     Returns:
       [R, P] in the robots' frames, x forward. Lengths are in m, within +-2; the distance to go is
       within 4. Directions are within +-1. Flags are 0 or 1. Rows of absent objects are 0.
     """
     target = _shown(*into_frame(pose, level.target))
-    own = [*target, arrived.astype(jnp.float32), jnp.minimum(to_go, FARTHEST)]
+    ahead = _direction(*into_frame(pose, waypoint))
+    own = [*target, arrived.astype(jnp.float32), jnp.minimum(to_go, FARTHEST), *ahead]
     parts = [jnp.stack(own, axis=-1), _robots(pose, level, arrived), _rectangles(pose, level)]
     found = jnp.concatenate(parts, axis=-1)
     # Learning skips an arena with broken physics, but its critic still needs finite numbers.
     return jnp.where(jnp.isfinite(found), found, 0.0)
+
+
+def _direction(x: Array, y: Array) -> tuple[Array, Array]:
+    """Scales vectors to length 1, and those shorter than `_NEAR` to less."""
+    length = jnp.maximum(jnp.hypot(x, y), _NEAR)
+    return x / length, y / length
 
 
 def _shown(x: Array, y: Array) -> tuple[Array, Array]:

@@ -116,6 +116,39 @@ def test_paths_are_as_long_as_those_of_the_judge(drawn: Level) -> None:
     assert longer.max() < 0.04
 
 
+@pytest.mark.parametrize("height", [0.1, -0.1])
+def test_the_waypoint_is_the_corner_at_the_near_end_of_a_wall(height: float) -> None:
+    found = _waypoint(_level([-0.3, height], [0.3, height], [WALL]))
+    corner = [-0.01 - CORNER, np.sign(height) * (0.2 + CORNER)]
+    np.testing.assert_allclose(found, corner, atol=ROUND)
+
+
+def test_the_waypoint_is_the_target_where_nothing_is_in_the_way() -> None:
+    beside = [0.0, 0.1, 0.0, 0.05, 0.05]
+    found = _waypoint(_level([-0.3, 0.0], [0.3, 0.0], [beside]))
+    np.testing.assert_array_equal(found, np.float32([0.3, 0.0]))
+
+
+def _waypoint(drawn: Level) -> np.ndarray:
+    drawn = jax.tree.map(jnp.asarray, drawn)
+    path = geodesic.begin(drawn, HULL)
+    return np.asarray(geodesic.waypoint(path, drawn.start[:, :2], drawn))[0]
+
+
+def test_a_step_towards_the_waypoint_shortens_the_path_by_at_least_as_much(drawn: Level) -> None:
+    drawn = jax.tree.map(jnp.asarray, drawn)
+    path = jax.jit(jax.vmap(partial(geodesic.begin, hull_radius=HULL)))(drawn)
+    place, step = drawn.start[..., :2], 1e-3  # m
+    away = jax.vmap(geodesic.waypoint)(path, place, drawn) - place
+    length = jnp.linalg.norm(away, axis=-1, keepdims=True)
+    go_on = jax.jit(jax.vmap(partial(geodesic.go_on, hull_radius=HULL)))
+    shorter = path.distance - go_on(path, place + step * away / length, drawn).distance
+    there = np.asarray(drawn.present & (length[..., 0] > step))
+    # Lengths are below 5 m and have float32 errors of a few 1e-7 m. A step can bring a nearer
+    # corner into view, and then shortens the path by more.
+    assert np.asarray(shorter)[there].min() > step - 3e-6
+
+
 class Driven(NamedTuple):
     """The first and last state of an episode, and its rewards, which are path progress alone."""
 
@@ -166,6 +199,15 @@ def test_a_critic_of_the_state_sees_how_long_the_path_is(driven: Driven) -> None
     straight, path = driven.ended.distance[0], driven.ended.path.distance[0]
     assert path > straight + 0.05  # m; the wall is in the way
     assert seen[0, 3] == path
+
+
+def test_a_critic_of_the_state_sees_where_the_path_leads(driven: Driven) -> None:
+    seen = env.look_around(driven.world, driven.ended)
+    pose = physics.poses(driven.world.physics, driven.ended.sim)[0]
+    corner = np.array([-0.01 - CORNER, 0.2 + CORNER])  # at the near end of the wall
+    bearing = np.arctan2(*(corner - pose[:2])[::-1]) - pose[2]
+    # 1e-4 covers float32 places within 0.1 m of the corner.
+    np.testing.assert_allclose(seen[0, 4:6], [np.cos(bearing), np.sin(bearing)], atol=1e-4)
 
 
 def test_without_paths_it_sees_the_straight_distance(driven: Driven) -> None:

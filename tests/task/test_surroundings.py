@@ -28,7 +28,8 @@ def _level(robots: int, boxes: np.ndarray, side: float = 1.0, target: float = 0.
 def _look(pose: np.ndarray, level: Level, arrived: np.ndarray | None = None) -> np.ndarray:
     there = np.zeros(len(pose), bool) if arrived is None else arrived
     to_go = np.full(len(pose), TO_GO, np.float32)
-    found = jax.jit(surroundings.look)(pose.astype(np.float32), level, there, to_go)
+    given = pose.astype(np.float32), level, there, to_go, level.target
+    found = jax.jit(surroundings.look)(*given)
     assert found.shape == (len(pose), surroundings.SIZE)
     return np.asarray(found)
 
@@ -51,8 +52,19 @@ def test_a_target_is_seen_in_the_robots_frame() -> None:
 @pytest.mark.parametrize(("to_go", "shown"), [(0.0, 0.0), (3.9, 3.9), (4.1, 4.0)])
 def test_the_distance_to_go_is_shown_up_to_4_metres(to_go: float, shown: float) -> None:
     level, pose = _level(1, np.zeros((0, 5))), np.zeros((1, 3), np.float32)
-    found = surroundings.look(pose, level, np.zeros(1, bool), np.float32([to_go]))
+    given = pose, level, np.zeros(1, bool), np.float32([to_go]), level.target
+    found = surroundings.look(*given)
     np.testing.assert_allclose(found[0, 3], shown, atol=ROUND)
+
+
+@pytest.mark.parametrize(("away", "shown"), [(0.5, 1.0), (0.002, 1.0), (0.0005, 0.5), (0.0, 0.0)])
+def test_the_direction_to_the_waypoint_is_a_unit_vector_unless_it_is_at_hand(
+    away: float, shown: float
+) -> None:
+    level, pose = _level(1, np.zeros((0, 5))), np.float32([[0.0, 0.0, np.pi / 2]])
+    given = pose, level, np.zeros(1, bool), np.float32([TO_GO]), np.float32([[away, 0.0]])
+    # The robot faces north and the waypoint is in the east: to the right.
+    np.testing.assert_allclose(surroundings.look(*given)[0, 4:6], [0.0, -shown], atol=ROUND)
 
 
 def test_another_robot_is_seen_with_its_heading_and_its_target() -> None:
