@@ -87,6 +87,10 @@ class AlgoConfig(Section):
         default=None,
         metadata=about("module that computes the memory on a GPU", derived=True, stored=False),
     )
+    side_by_side: int = field(
+        default=1,
+        metadata=about("learners that a device trains at once", derived=True, stored=False),
+    )
     critic: Literal["observation", "state"] = field(
         default="observation",
         metadata=about(

@@ -81,6 +81,7 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
     size = world.observation_size
     algo = networks.bind(config.algo, pieces.networks, size, _state_size(config))
     algo = dispatch.bind_memory(networks.bind_hearing(algo, size, heard.count, heard.width))
+    algo = replace(algo, side_by_side=side_by_side(config) * config.learners)
     config = replace(config, algo=algo)
     backend = dispatch.resolve(algo, size, world.action_size)
     return Program(config, world, backend, by_robot), schedule(config)

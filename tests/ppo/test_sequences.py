@@ -226,13 +226,25 @@ def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
 
 
 # Stage s6 with 65,536 arenas, worlds with 4,096 arenas in 32 minibatches, one arena, and a million
-# sequences.
+# sequences. Ten learners of 4,096 arenas of worlds10 fill four tiles, and one learner fills one.
 @pytest.mark.parametrize(
-    ("sequences_", "minibatches", "steps", "expected"),
-    [(327_680, 8, 32, 10_240), (81_920, 32, 64, 1280), (5, 1, 32, 5), (10**6, 1, 32, 62_500)],
+    ("sequences_", "minibatches", "steps", "learners", "expected"),
+    [
+        (327_680, 8, 32, 1, 10_240),
+        (81_920, 32, 64, 1, 1280),
+        (5, 1, 32, 1, 5),
+        (10**6, 1, 32, 1, 62_500),
+        (40_960, 32, 64, 1, 1280),
+        (40_960, 32, 64, 10, 320),
+    ],
 )
 def test_an_accelerator_takes_a_minibatch_in_four_tiles_if_they_are_large(
-    monkeypatch: pytest.MonkeyPatch, sequences_: int, minibatches: int, steps: int, expected: int
+    monkeypatch: pytest.MonkeyPatch,
+    sequences_: int,
+    minibatches: int,
+    steps: int,
+    learners: int,
+    expected: int,
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert sequences.tile_size(sequences_, minibatches, steps) == expected
+    assert sequences.tile_size(sequences_, minibatches, steps, learners) == expected

@@ -24,9 +24,9 @@ from swarmjax.shards import ALONE, Shards
 # Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
 # are present, and are well filled where few are.
 CPU_TILE = 32
-# Fewest and most samples of a tile on an accelerator. An accelerator runs one step after the other,
-# so a large tile takes little longer than a small one. With default layers, the largest tile takes
-# about 12 GB for each learner and seed.
+# Fewest and most samples of a tile on an accelerator, for all learners side by side. An accelerator
+# runs one step after the other, so a large tile takes little longer than a small one. With default
+# layers, the largest tile takes about 12 GB.
 TILE_SAMPLES = 2**17, 2**21
 # Between these bounds, an accelerator splits a full minibatch into this many tiles. Where most
 # robots are absent, most of the tiles are left out.
@@ -154,7 +154,8 @@ def gradient(
     Returns:
       The gradient, and the metrics of the loss; 0 if the span is empty.
     """
-    size = tile_size(len(order), config.num_minibatches, config.rollout_length)
+    steps, learners = config.rollout_length, config.side_by_side
+    size = tile_size(len(order), config.num_minibatches, steps, learners)
 
     def of_tile(i: jax.Array | int) -> tuple[Params, Metrics]:
         tile = take_tile(rows, order, span[0] + i * size, span[1], size)
@@ -163,13 +164,14 @@ def gradient(
     return blocks.add_up(tiles_of(span, size), of_tile)
 
 
-def tile_size(sequences: int, minibatches: int, steps: int) -> int:
+def tile_size(sequences: int, minibatches: int, steps: int, learners: int = 1) -> int:
     """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
 
     Args:
       sequences: Q of the batch.
       minibatches: M.
       steps: T of a sequence.
+      learners: How many learners a device trains at once, each with such a batch.
 
     Returns:
       At least 1. On an accelerator it respects `TILE_SAMPLES`.
@@ -178,7 +180,7 @@ def tile_size(sequences: int, minibatches: int, steps: int) -> int:
     if jax.default_backend() == "cpu":
         most = CPU_TILE
     else:
-        least, limit = (max(1, samples // steps) for samples in TILE_SAMPLES)
+        least, limit = (max(1, samples // (steps * learners)) for samples in TILE_SAMPLES)
         most = min(max(least, -(-fullest // _TILES)), limit)
     return -(-fullest // -(-fullest // most))
 
