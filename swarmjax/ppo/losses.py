@@ -77,7 +77,7 @@ def ppo_loss(
     Returns:
       The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
       `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
-      `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
+      `clip_fraction` (0..1) and, if there is a `guess_cost`, `guess_loss`.
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(
@@ -113,7 +113,8 @@ def _terms(
         "approx_kl": mean(ratio - 1.0 - log_ratio),
         "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
-    if acted.guess is not None and minibatch.state is not None:
+    # Without a cost the term is left out, so that XLA does not compute the guess.
+    if config.guess_cost and acted.guess is not None and minibatch.state is not None:
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return metrics
@@ -129,7 +130,7 @@ def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
     )
     if "guess_loss" not in metrics:
         return total
-    assert config.guess_cost is not None  # the config has filled it in
+    assert config.guess_cost  # or there is no such loss
     return total + config.guess_cost * metrics["guess_loss"]
 
 

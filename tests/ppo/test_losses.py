@@ -163,7 +163,7 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
     minibatch = replace(_minibatch(), state=state)
     count = jnp.float32(14.0)
     loss, metrics = ppo_loss(params, minibatch, config, count)
-    free, _ = ppo_loss(params, minibatch, replace(config, guess_cost=0.0), count)
+    free, without = ppo_loss(params, minibatch, replace(config, guess_cost=0.0), count)
     flat = traverse_util.flatten_dict(params["actor"], sep="/")
     layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}
     hidden = np.tanh(
@@ -173,3 +173,4 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
     expected = (error[minibatch.valid] ** 2).sum() / 14.0
     np.testing.assert_allclose(metrics["guess_loss"], expected, rtol=1e-5)  # float32
     np.testing.assert_allclose(loss - free, cost * expected, rtol=1e-5)
+    assert "guess_loss" not in without
