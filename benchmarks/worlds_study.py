@@ -110,7 +110,7 @@ class Study(Section):
     without: Literal["nothing", "memory", "messages", "state"] = field(
         default="nothing", metadata=about("part of the recipe that is left out")
     )
-    points: int = field(default=5, metadata=about("evenly spaced points of judging", 1, 1000))
+    points: int = field(default=16, metadata=about("evenly spaced points of judging", 1, 1000))
     levels: int = field(default=64, metadata=about("levels of each family", 1, 2**20))
     level_seed: int = field(default=5, metadata=about("of these levels", 0, MAX_COUNT))
     steps: int = field(default=3000, metadata=about("control steps of an episode", 1, 10**6))

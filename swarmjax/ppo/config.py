@@ -94,8 +94,8 @@ class AlgoConfig(Section):
     critic: Literal["observation", "state"] = field(
         default="observation",
         metadata=about(
-            "what the critic sees; state: also targets, other robots, walls and the distance to "
-            "go, none of which the policy sees"
+            "what the critic sees; state: also targets, other robots, walls, the distance to go "
+            "and the direction of the path, none of which the policy sees"
         ),
     )
     activation: Literal["tanh", "relu", "swish"] = field(

@@ -77,7 +77,7 @@ def ppo_loss(
     Returns:
       The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
       `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
-      `clip_fraction` (0..1) and, if there is a `guess_cost`, `guess_loss`.
+      `clip_fraction` (0..1) and, if `guess_cost` is not 0, `guess_loss`.
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(

@@ -28,6 +28,8 @@ from swarmjax.task.surroundings import into_frame
 # radius.
 _WIDENED = 0.8
 _CORNER = 0.9
+# m; lengths of a path that differ by less are equal. They are float32 sums below 10 m.
+_SAME = 1e-4
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 
 
@@ -99,15 +101,16 @@ def waypoint(path: Path, place: Array, level: Level) -> Array:
       level: level of the episode.
 
     Returns:
-      [R, 2] x and y, m. Without a path, it is an arbitrary corner or the target.
+      [R, 2] x and y, m. For a robot without a path, it is the target.
     """
     corner = jnp.broadcast_to(path.roadmap.corner, (len(place), *path.roadmap.corner.shape))
     choices = jnp.concatenate([level.target[:, None], corner], axis=1)
     to_go = jnp.pad(path.roadmap.to_go, ((0, 0), (1, 0)))
     length = jnp.linalg.norm(choices - place[:, None], axis=-1) + to_go
-    # The waypoint is the choice whose path has the measured length. So lines of sight, which are
-    # costly, are not checked again.
-    chosen = jnp.argmin(jnp.abs(length - path.distance[:, None]), axis=1)
+    # The waypoint is the choice whose path has the measured length, so lines of sight, which are
+    # costly, are not checked again. A hidden corner has the same length only by chance.
+    off = jnp.abs(length - path.distance[:, None])
+    chosen = jnp.where(jnp.min(off, axis=1) < _SAME, jnp.argmin(off, axis=1), 0)
     return jnp.take_along_axis(choices, chosen[:, None, None], axis=1)[:, 0]
 
 

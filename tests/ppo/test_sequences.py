@@ -159,13 +159,13 @@ def test_tiles_follow_useful_sequences_and_not_robots(useful: int, tiles: int) -
     for robots in (40, 400):
         marked = jnp.arange(robots) < useful
         span = sequences.deal(jax.random.key(0), marked, 1).span[0]
-        size = sequences.tile_size(robots, 1, STEPS)
+        size = sequences.tile_size(robots, 1, STEPS, learners=1)
         assert size == 5
         assert int(sequences.tiles_of(span, size)) == tiles
 
 
 def test_a_tile_holds_no_more_than_the_fullest_minibatch() -> None:
-    assert sequences.tile_size(sequences=12, minibatches=4, steps=STEPS) == 3
+    assert sequences.tile_size(sequences=12, minibatches=4, steps=STEPS, learners=1) == 3
 
 
 def test_absent_robots_may_hold_nan() -> None:
@@ -226,25 +226,28 @@ def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
 
 
 # Stage s6 with 65,536 arenas, worlds with 4,096 arenas in 32 minibatches, one arena, and a million
-# sequences. Ten learners of 4,096 arenas of worlds10 fill four tiles, and one learner fills one.
+# sequences.
 @pytest.mark.parametrize(
-    ("sequences_", "minibatches", "steps", "learners", "expected"),
-    [
-        (327_680, 8, 32, 1, 10_240),
-        (81_920, 32, 64, 1, 1280),
-        (5, 1, 32, 1, 5),
-        (10**6, 1, 32, 1, 62_500),
-        (40_960, 32, 64, 1, 1280),
-        (40_960, 32, 64, 10, 320),
-    ],
+    ("sequences_", "minibatches", "steps", "expected"),
+    [(327_680, 8, 32, 10_240), (81_920, 32, 64, 1280), (5, 1, 32, 5), (10**6, 1, 32, 62_500)],
 )
 def test_an_accelerator_takes_a_minibatch_in_four_tiles_if_they_are_large(
-    monkeypatch: pytest.MonkeyPatch,
-    sequences_: int,
-    minibatches: int,
-    steps: int,
-    learners: int,
-    expected: int,
+    monkeypatch: pytest.MonkeyPatch, sequences_: int, minibatches: int, steps: int, expected: int
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert sequences.tile_size(sequences_, minibatches, steps, learners) == expected
+    assert sequences.tile_size(sequences_, minibatches, steps, learners=1) == expected
+
+
+# A full minibatch of 1,280 sequences has one tile, then four. 2 million samples of 1,000 learners
+# are 32 sequences of each.
+@pytest.mark.parametrize(("learners", "expected"), [(1, 1280), (10, 320), (1000, 32)])
+def test_learners_side_by_side_share_the_samples_of_a_tile(
+    monkeypatch: pytest.MonkeyPatch, learners: int, expected: int
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert sequences.tile_size(40_960, 32, 64, learners) == expected
+
+
+def test_a_tile_of_many_learners_fills_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert sequences.tile_size(1024, 32, 64, learners=1000) == 16

@@ -129,6 +129,21 @@ def test_the_waypoint_is_the_target_where_nothing_is_in_the_way() -> None:
     np.testing.assert_array_equal(found, np.float32([0.3, 0.0]))
 
 
+def test_without_a_path_the_waypoint_is_the_target() -> None:
+    walls = [[0.0, 0.0, 0.0, 0.01, 0.6]]  # from wall to wall
+    drawn = _level([-0.3, 0.0], [0.3, 0.0], walls)
+    path = geodesic.begin(drawn, HULL)
+    # The robot keeps the distance of its start, which no path has from its new place.
+    found = geodesic.waypoint(path, jnp.array([[-0.1, 0.2]]), jax.tree.map(jnp.asarray, drawn))
+    np.testing.assert_array_equal(found[0], np.float32([0.3, 0.0]))
+
+
+def test_the_waypoint_is_no_corner_of_an_absent_obstacle() -> None:
+    drawn = _level([-0.3, 0.0], [0.3, 0.0], [WALL])
+    found = _waypoint(drawn._replace(obstacle_present=np.zeros(1, bool)))
+    np.testing.assert_array_equal(found, np.float32([0.3, 0.0]))
+
+
 def _waypoint(drawn: Level) -> np.ndarray:
     drawn = jax.tree.map(jnp.asarray, drawn)
     path = geodesic.begin(drawn, HULL)
@@ -213,6 +228,11 @@ def test_a_critic_of_the_state_sees_where_the_path_leads(driven: Driven) -> None
 def test_without_paths_it_sees_the_straight_distance(driven: Driven) -> None:
     seen = env.look_around(driven.world, dataclasses.replace(driven.ended, path=None))
     assert seen[0, 3] == driven.ended.distance[0]
+
+
+def test_without_paths_it_sees_the_direction_of_the_target(driven: Driven) -> None:
+    seen = env.look_around(driven.world, dataclasses.replace(driven.ended, path=None))[0]
+    np.testing.assert_allclose(seen[4:6], seen[:2] / np.hypot(*seen[:2]), atol=ROUND)
 
 
 def test_without_its_weight_no_path_is_kept(tiny_world: env.World) -> None:

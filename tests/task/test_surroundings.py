@@ -57,8 +57,9 @@ def test_the_distance_to_go_is_shown_up_to_4_metres(to_go: float, shown: float) 
     np.testing.assert_allclose(found[0, 3], shown, atol=ROUND)
 
 
+# Distances in m. The direction fades within `surroundings._NEAR`, 1 mm.
 @pytest.mark.parametrize(("away", "shown"), [(0.5, 1.0), (0.002, 1.0), (0.0005, 0.5), (0.0, 0.0)])
-def test_the_direction_to_the_waypoint_is_a_unit_vector_unless_it_is_at_hand(
+def test_the_direction_to_the_waypoint_is_a_unit_vector_unless_it_is_within_1_mm(
     away: float, shown: float
 ) -> None:
     level, pose = _level(1, np.zeros((0, 5))), np.float32([[0.0, 0.0, np.pi / 2]])

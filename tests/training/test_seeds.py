@@ -219,6 +219,15 @@ def test_a_call_steps_the_seeds_of_a_group_side_by_side(
     assert programs.side_by_side(replace(tiny_config, seeds=6, seeds_by=by)) == expected
 
 
+@pytest.mark.parametrize(("by", "learners"), [("vmap", 18), ("map", 3)])
+def test_networks_know_how_many_learners_train_side_by_side(
+    by: Literal["vmap", "map"], learners: int, tiny_config: TrainConfig
+) -> None:
+    algo = replace(tiny_config.algo, policy="independent")  # one for each of three robots
+    config = replace(tiny_config, seeds=6, seeds_by=by, algo=algo)
+    assert programs.load(config)[0].config.algo.side_by_side == learners
+
+
 def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
     assert list(seeds.numbers(replace(tiny_config, seed=7, seeds=3))) == [7, 8, 9]
 

@@ -28,6 +28,8 @@ CPU_TILE = 32
 # runs one step after the other, so a large tile takes little longer than a small one. With default
 # layers, the largest tile takes about 12 GB.
 TILE_SAMPLES = 2**17, 2**21
+# The memory kernels compute at least so many sequences at once.
+FEWEST_SEQUENCES = 16
 # Between these bounds, an accelerator splits a full minibatch into this many tiles. Where most
 # robots are absent, most of the tiles are left out.
 _TILES = 4
@@ -164,7 +166,7 @@ def gradient(
     return blocks.add_up(tiles_of(span, size), of_tile)
 
 
-def tile_size(sequences: int, minibatches: int, steps: int, learners: int = 1) -> int:
+def tile_size(sequences: int, minibatches: int, steps: int, learners: int) -> int:
     """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
 
     Args:
@@ -174,13 +176,15 @@ def tile_size(sequences: int, minibatches: int, steps: int, learners: int = 1) -
       learners: How many learners a device trains at once, each with such a batch.
 
     Returns:
-      At least 1. On an accelerator it respects `TILE_SAMPLES`.
+      At least 1. On an accelerator it respects `TILE_SAMPLES`, unless that is less than
+      `FEWEST_SEQUENCES`.
     """
     fullest = -(-sequences // minibatches)
     if jax.default_backend() == "cpu":
         most = CPU_TILE
     else:
-        least, limit = (max(1, samples // (steps * learners)) for samples in TILE_SAMPLES)
+        bounds = (samples // (steps * learners) for samples in TILE_SAMPLES)
+        least, limit = (max(FEWEST_SEQUENCES, bound) for bound in bounds)
         most = min(max(least, -(-fullest // _TILES)), limit)
     return -(-fullest // -(-fullest // most))
 
