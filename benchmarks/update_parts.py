@@ -27,7 +27,7 @@ from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.settings import TrainConfig, load_train
-from swarmjax.training import loop, rollout
+from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
@@ -51,32 +51,38 @@ def learn(program: Program, state: TrainState, batch: Batch, key: Array) -> Lear
 
 
 def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
-    """Times each part of an update; yields a line for each.
+    """Times each part of an update of all seeds; yields a line for each.
 
     Raises:
-      ConfigError: if there are several seeds or devices.
+      ConfigError: if there are several devices.
     """
-    for key, count in (("seeds", settings.seeds), ("devices", settings.devices)):
-        if count > 1:
-            raise ConfigError(
-                f"{key} is {count}: give {key}=1, because the parts of one are timed."
-            )
+    if settings.devices > 1:
+        raise ConfigError(
+            f"devices is {settings.devices}: give devices=1, because the parts of one are timed."
+        )
     program, schedule = programs.load(settings)
-    state = jax.jit(partial(loop.init, program))(schedule)
-    key = jax.random.key(settings.seed)
+    state = jax.jit(partial(seeds.init, program))(schedule)
+    key = jax.random.split(jax.random.key(settings.seed), settings.seeds)
     about = {
+        "seeds": settings.seeds,
         "arenas": settings.arenas,
         "stages": len(settings.stage),
         "rollout_length": settings.algo.rollout_length,
         "waiting": settings.waiting,
         **steps_per_second.made_with(),
     }
-    line, waiting = _timed("draw", partial(draw, program), (schedule, state, key))
+    of_seeds = partial(_of_seeds, program)
+    line, waiting = _timed("draw", of_seeds(partial(draw, program, schedule)), (state, key))
     yield line | about
-    line, batch = _timed("collect", partial(collect, program), (state, waiting, key))
+    line, batch = _timed("collect", of_seeds(partial(collect, program)), (state, waiting, key))
     yield line | about
-    line, _ = _timed("learn", partial(learn, program), (state, batch, key))
+    line, _ = _timed("learn", of_seeds(partial(learn, program)), (state, batch, key))
     yield line | about
+
+
+def _of_seeds(program: Program, part: Callable[..., Any]) -> Callable[..., Any]:
+    """Applies a part of an update to all seeds, as training does."""
+    return lambda *lanes: seeds.each(program.config, lambda lane: part(*lane), lanes)
 
 
 def _timed(part: str, call: Callable[..., Any], given: tuple) -> tuple[dict[str, Any], Any]:

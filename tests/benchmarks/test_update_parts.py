@@ -42,7 +42,12 @@ def test_each_part_has_a_line(tiny_config: TrainConfig) -> None:
     assert all(line["ms"] > 0.0 and line["compile_s"] > 0.0 for line in lines)
 
 
-@pytest.mark.parametrize("key", ["seeds", "devices"])
-def test_one_seed_on_one_device_is_timed(tiny_config: TrainConfig, key: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{key} is 2: give {key}=1"):
-        next(update_parts.results(replace(tiny_config, **{key: 2})))
+@pytest.mark.slow
+def test_the_parts_of_several_seeds_are_timed_together(tiny_config: TrainConfig) -> None:
+    lines = list(update_parts.results(replace(tiny_config, seeds=2)))
+    assert [line["seeds"] for line in lines] == [2, 2, 2]
+
+
+def test_one_device_is_timed(tiny_config: TrainConfig) -> None:
+    with pytest.raises(ConfigError, match="^devices is 2: give devices=1"):
+        next(update_parts.results(replace(tiny_config, devices=2)))
