@@ -49,5 +49,5 @@ def test_the_parts_of_several_seeds_are_timed_together(tiny_config: TrainConfig)
 
 
 def test_one_device_is_timed(tiny_config: TrainConfig) -> None:
-    with pytest.raises(ConfigError, match="^devices is 2: give devices=1"):
+    with pytest.raises(ConfigError, match=r"^devices is 2: give devices=1"):
         next(update_parts.results(replace(tiny_config, devices=2)))
