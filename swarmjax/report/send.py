@@ -19,7 +19,9 @@ def of_run(run: Path, history: History) -> list[Logger]:
     """
     asked = history.config.run
     weights_and_biases.check(history.config)
-    found: list[Logger] = [Boards(run, history.config.numbers)] if asked.tensorboard else []
+    names = [stage.name for stage in history.config.stage]
+    boards = Boards(run, history.config.numbers, names)
+    found: list[Logger] = [boards] if asked.tensorboard else []
     found += [WandbRuns(history.config, run)] if asked.wandb else []
     if not found:
         raise ConfigError(

@@ -10,7 +10,6 @@ import numpy as np
 from swarmjax.run import directory
 from swarmjax.run.directory import DECISIONS, EPISODES, METRICS, Log, Row
 from swarmjax.run.loggers import Guarded, Logger
-from swarmjax.run.tensorboard import Boards
 from swarmjax.sim import gaps
 
 _READ = (METRICS, DECISIONS)
@@ -85,10 +84,7 @@ class Recorder:
         self,
         run: Path,
         *,
-        seeds: Sequence[int],
-        tensorboard: bool,
         update: int,
-        arena_steps: int = 0,
         episodes: bool = False,
         logs: Mapping[str, int] | None = None,
         loggers: Sequence[Logger] = (),
@@ -97,14 +93,11 @@ class Recorder:
 
         Args:
           run: the run directory.
-          seeds: of the run.
-          tensorboard: whether to write TensorBoard events.
           update: updates done at the checkpoint.
-          arena_steps: arena steps done at the checkpoint, for TensorBoard's axis.
           episodes: whether to log episodes.
           logs: bytes of each log at the checkpoint. Checkpoints of older versions do not record
             them; rows are then dropped by their update.
-          loggers: further loggers, which receive the rows and are closed at the end.
+          loggers: receive the rows too, and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in directory.LOGS:
@@ -116,9 +109,7 @@ class Recorder:
         self._logs = {name: Log(run / name) for name in names}
         # A log that this process does not write still belongs to the run.
         self._closed = {k: length for k, length in (logs or {}).items() if k not in names}
-        purge = arena_steps + 1 if update else None  # TensorBoard hides older events from here on
-        boards = [Boards(run, seeds, purge)] if tensorboard else []
-        self._loggers = [Guarded(each) for each in (*boards, *loggers)]
+        self._loggers = [Guarded(each) for each in loggers]
 
     def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows and decisions of a call. Loggers also receive its speeds."""

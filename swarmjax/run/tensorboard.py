@@ -3,7 +3,7 @@
 import contextlib
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,18 @@ class Boards:
 
     name = "TensorBoard"
 
-    def __init__(self, run: Path, seeds: Sequence[int], purge: int | None = None) -> None:
+    def __init__(
+        self, run: Path, seeds: Sequence[int], stages: Sequence[str], purge: int | None = None
+    ) -> None:
         """Prepares a folder for each of the first `BOARDS` seeds, but opens nothing yet.
 
-        TensorBoard hides older events from arena step `purge` on.
+        Args:
+          run: the run directory.
+          seeds: of the run.
+          stages: names of the stages of its curriculum.
+          purge: arena step from which on TensorBoard hides older events; None: it hides none.
         """
+        self._stages = stages
         folder = run / FOLDER
         several = len(seeds) > 1
         self._folders = {k: folder / f"seed{k}" if several else folder for k in seeds[:BOARDS]}
@@ -43,8 +50,8 @@ class Boards:
         boards = self._boards()
         for row in rows:
             if row["seed"] in boards and row["update"] % len(boards) == 0:
-                boards[row["seed"]].add(row, row["arena_steps"])
-        next(iter(boards.values())).add(speeds, rows[-1]["arena_steps"])
+                boards[row["seed"]].add(numbers(row, self._stages), row["arena_steps"])
+        next(iter(boards.values())).add(numbers(speeds), rows[-1]["arena_steps"])
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
         """Writes a PNG as an image, or the path of any other file, to the first folder."""
@@ -85,10 +92,10 @@ class Board:
             event.session_log.status = event.session_log.START
             self._writer.write_event(event)
 
-    def add(self, row: Row, arena_steps: int) -> None:
-        """Writes the numbers of a row."""
+    def add(self, values: Mapping[str, float], arena_steps: int) -> None:
+        """Writes numbers by name."""
         event = _event(arena_steps)
-        for name, value in numbers(row).items():
+        for name, value in values.items():
             event.summary.value.add(tag=name, simple_value=value)
         self._writer.write_event(event)
 
@@ -117,16 +124,23 @@ class Board:
         self._writer.close()
 
 
-def numbers(row: Row) -> dict[str, float]:
+def numbers(row: Row, stages: Sequence[str] = ()) -> dict[str, float]:
     """Lists the numbers of a row by name.
 
-    A list has a number for each stage of the curriculum. The number of stage i gets the name of the
-    list, a slash and i, from 0. Entries without a number are left out.
+    A list has a number for each stage of the curriculum. This number gets the name of the list, a
+    slash and the name of the stage. Entries without a number are left out.
+
+    Args:
+      row: row of `metrics.jsonl`.
+      stages: names of the stages.
+
+    Returns:
+      The numbers.
     """
     found = {}
     for name, value in row.items():
         if isinstance(value, list):
-            parts = {f"{name}/{i}": part for i, part in enumerate(value)}
+            parts = {f"{name}/{stage}": x for stage, x in zip(stages, value, strict=True)}
         else:
             parts = {name: value}
         found |= {key: part for key, part in parts.items() if isinstance(part, int | float)}

@@ -23,9 +23,11 @@ from swarmjax.run.checkpoint import Checkpoints, Kept
 from swarmjax.run.directory import EPISODES, METRICS, Row
 from swarmjax.run.display import Display, summarize
 from swarmjax.run.errors import CheckpointError, DivergedError
+from swarmjax.run.loggers import Logger
 from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
+from swarmjax.run.tensorboard import Boards
 from swarmjax.run.weights_and_biases import WandbRuns
 from swarmjax.sim import physics
 from swarmjax.sim.config import physics_substeps
@@ -382,14 +384,23 @@ def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Record
     settings = program.config
     return Recorder(
         run,
-        seeds=seeds.numbers(settings),
-        tensorboard=settings.run.tensorboard,
         episodes=settings.run.episodes,
         update=done,
-        arena_steps=done * settings.arenas * settings.algo.rollout_length,
         logs=None if kept is None else kept.logs,
-        loggers=[WandbRuns(settings, run)] if settings.run.wandb and hosts.is_first() else [],
+        loggers=_loggers(run, settings, done),
     )
+
+
+def _loggers(run: Path, settings: TrainConfig, done: int) -> list[Logger]:
+    """Makes the loggers that a config names, for a run that has done `done` updates."""
+    found: list[Logger] = []
+    if settings.run.tensorboard:
+        steps = done * settings.arenas * settings.algo.rollout_length
+        names = [stage.name for stage in settings.stage]
+        found.append(Boards(run, settings.numbers, names, steps + 1 if done else None))
+    if settings.run.wandb and hosts.is_first():
+        found.append(WandbRuns(settings, run))
+    return found
 
 
 def _build_kernels(program: Built, state: TrainState) -> float:

@@ -19,11 +19,14 @@ from swarmjax import train
 from swarmjax.config import ConfigError
 from swarmjax.run import loggers
 from swarmjax.run.loggers import Calls, Guarded
-from swarmjax.run.tensorboard import Boards
+from swarmjax.run.tensorboard import Boards, numbers
 from swarmjax.task.stage_config import StageConfig
 
+STAGES = ["pair", "trio"]
 TINY = {
-    "stage": [StageConfig(name="pair", robots=2, side=0.5)],
+    "stage": [
+        StageConfig(name=name, robots=robots, side=0.5) for robots, name in enumerate(STAGES, 2)
+    ],
     "sim.impl": "jax",
     "arenas": 16,
     "algo": {"rollout_length": 4, "num_minibatches": 2, "epochs": 1, "hidden_sizes": [8]},
@@ -84,10 +87,11 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
 
 
 def _numbers(row: dict) -> dict[str, float]:
-    """Returns the numbers of a row; that of stage i has the name of its list, a slash and i."""
+    """Returns the numbers of a row; that of a stage has the name of its list, a slash, its name."""
     found: dict[str, float] = {k: v for k, v in row.items() if isinstance(v, int | float)}
     for name in (k for k, v in row.items() if isinstance(v, list)):
-        found |= {f"{name}/{i}": v for i, v in enumerate(row[name]) if v is not None}
+        parts = zip(STAGES, row[name], strict=True)
+        found |= {f"{name}/{stage}": v for stage, v in parts if v is not None}
     return found
 
 
@@ -224,7 +228,7 @@ def test_tensorboard_takes_figures_and_the_places_of_pages(tmp_path: Path) -> No
     picture, page = tmp_path / "mix.png", tmp_path / "replay.html"
     picture.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">II", 640, 480))
     page.write_text("<p>a replay</p>")
-    boards = Boards(tmp_path, [0])
+    boards = Boards(tmp_path, [0], [])
     boards.attach("mix", picture, 128)
     boards.attach("replay", page, 128)
     boards.close()
@@ -234,6 +238,12 @@ def test_tensorboard_takes_figures_and_the_places_of_pages(tmp_path: Path) -> No
     assert (first.step, image.width, image.height) == (128, 640, 480)
     assert image.encoded_image_string == picture.read_bytes()
     assert second.summary.value[0].tensor.string_val == [f"`{page}`".encode()]
+
+
+def test_numbers_of_a_stage_have_its_name() -> None:
+    row = {"update": 3, "stage": "s2", "success_by_stage": [0.5, None, 0.25]}
+    expected = {"update": 3, "success_by_stage/s1": 0.5, "success_by_stage/s3": 0.25}
+    assert numbers(row, ["s1", "s2", "s3"]) == expected
 
 
 @pytest.mark.parametrize("given", [3, "metrics.jsonl", [print, None]])
