@@ -58,8 +58,8 @@ def _config(base: TrainConfig, **options: Any) -> TrainConfig:
 
 @pytest.fixture(
     scope="module",
-    params=[{"mode": "learnability"}, {"mode": "value_loss", "mutation": 0.5}],
-    ids=["learnability", "value_loss"],
+    params=[{"mode": "learnability"}, {"mode": "failure"}, {"mode": "value_loss", "mutation": 0.5}],
+    ids=["learnability", "failure", "value_loss"],
 )
 def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained:
     program, schedule = programs.load(_config(tiny_config, **request.param))
