@@ -142,7 +142,7 @@ def result(config: PriceConfig, settings: TrainConfig) -> dict[str, Any]:
         "arena_steps_per_s_without": median([free for _, free in pairs])[0] * steps,
         "arenas": settings.arenas,
         "robot": settings.robot.body,
-        "stages": [stage.name for stage in settings.stage],
+        "stages": settings.stage_names,
         "compile_s": steady.compiled.seconds,
         "impl": dispatch.resolve_impl(settings.sim.impl),
         "device": provenance.device(),

@@ -243,7 +243,7 @@ def _line(study: StudyConfig, arm: str, trained: TrainConfig, at: np.ndarray) ->
         "arm": study.label or arm,
         "policy": trained.algo.policy,
         "curriculum": whole["curriculum"],
-        "stages": [stage.name for stage in trained.stage],
+        "stages": trained.stage_names,
         "seeds": list(seeds.numbers(trained)),
         "arenas": trained.arenas,
         "budget": trained.budget,

@@ -51,7 +51,7 @@ def result(settings: TrainConfig) -> dict[str, Any]:
         "transitions_per_s": median([many for _, many in pairs])[0],
         "compile_s_of_one": one.compile_s,
         "compile_s": all_.compile_s,
-        "stages": [stage.name for stage in settings.stage],
+        "stages": settings.stage_names,
         "impl": dispatch.resolve_impl(settings.sim.impl),
         "device": provenance.device(),
         "versions": provenance.versions(),

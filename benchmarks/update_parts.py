@@ -82,7 +82,11 @@ def results(settings: TrainConfig) -> Iterator[dict[str, Any]]:
 
 def _of_seeds(program: Program, part: Callable[..., Any]) -> Callable[..., Any]:
     """Applies a part of an update to all seeds, as training does."""
-    return lambda *lanes: seeds.each(program.config, lambda lane: part(*lane), lanes)
+
+    def of_one(given: tuple) -> Any:
+        return part(*given)
+
+    return lambda *given: seeds.each(program.config, of_one, given)
 
 
 def _timed(part: str, call: Callable[..., Any], given: tuple) -> tuple[dict[str, Any], Any]:

@@ -109,7 +109,7 @@ class History:
     @property
     def names(self) -> list[str]:
         """The names of the stages."""
-        return [stage.name for stage in self.config.stage]
+        return self.config.stage_names
 
     @property
     def success(self) -> np.ndarray:

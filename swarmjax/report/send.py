@@ -19,8 +19,7 @@ def of_run(run: Path, history: History) -> list[Logger]:
     """
     asked = history.config.run
     weights_and_biases.check(history.config)
-    names = [stage.name for stage in history.config.stage]
-    boards = Boards(run, history.config.numbers, names)
+    boards = Boards(run, history.config.numbers, history.names)
     found: list[Logger] = [boards] if asked.tensorboard else []
     found += [WandbRuns(history.config, run)] if asked.wandb else []
     if not found:

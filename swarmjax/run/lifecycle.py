@@ -450,7 +450,7 @@ def _write_summary(run: Path, program: Built, tally: Tally) -> None:
     train_s, transitions = tally.earlier_s + tally.seconds, tally.transitions
     summary = {
         "stage": settings.stage_name,
-        "stages": [stage.name for stage in settings.stage],
+        "stages": settings.stage_names,
         "seeds": list(every),
         "updates": tally.update,
         "budget_spent": tally.update >= settings.updates,

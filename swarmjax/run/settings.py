@@ -175,14 +175,14 @@ class TrainConfig(ProgramConfig):
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
             object.__setattr__(self, "streams", self.stream_count)
-        names = [stage.name for stage in self.stage]
+        names = self.stage_names
         if len(names) == 1 or not self.stage_name:
             object.__setattr__(self, "stage_name", "-".join(names))
 
     def _check_stages(self) -> None:
         if not self.stage:
             raise ConfigError("stage is []: give at least one stage.")
-        names = [stage.name for stage in self.stage]
+        names = self.stage_names
         for name in names:
             if names.count(name) > 1:
                 raise ConfigError(f"stage names {name} more than once: give each stage once.")

@@ -319,7 +319,7 @@ def score(settings: TrainConfig, tally: Tally) -> float | None:
     Returns:
       The mean score over the seeds; None until every seed has been measured.
     """
-    names = [stage.name for stage in settings.stage]
+    names = settings.stage_names
     found = [
         max((names.index(name) + share for name, share in of_seed.items()), default=None)
         for of_seed in tally.targets_reached.values()
@@ -370,7 +370,7 @@ def begin_tally(
 
 def _add(settings: TrainConfig, tally: Tally, rows: list[Row], decisions: list[Row]) -> None:
     """Adds rows and decisions to the tally."""
-    names = [stage.name for stage in settings.stage]
+    names = settings.stage_names
     for row in rows:
         tally.transitions[row["seed"]] += row["transitions"]
     for row in rows[-settings.seeds :]:
@@ -396,8 +396,8 @@ def _loggers(run: Path, settings: TrainConfig, done: int) -> list[Logger]:
     found: list[Logger] = []
     if settings.run.tensorboard:
         steps = done * settings.arenas * settings.algo.rollout_length
-        names = [stage.name for stage in settings.stage]
-        found.append(Boards(run, settings.numbers, names, steps + 1 if done else None))
+        purge = steps + 1 if done else None
+        found.append(Boards(run, settings.numbers, settings.stage_names, purge))
     if settings.run.wandb and hosts.is_first():
         found.append(WandbRuns(settings, run))
     return found
@@ -457,7 +457,7 @@ def _report(
 ) -> None:
     """Adds a call to the tally, logs it and its episodes, and shows it."""
     settings, log = program.config, metrics.pop(episodes.KEY, None)
-    names = [stage.name for stage in settings.stage]
+    names = settings.stage_names
     control_steps = settings.arenas * settings.algo.rollout_length
     tally.update += n
     tally.seconds += seconds
@@ -486,7 +486,7 @@ def _log_episodes(
     display: Display,
 ) -> None:
     """Writes the episodes of a call to their log."""
-    names, numbers = [stage.name for stage in settings.stage], seeds.numbers(settings)
+    names, numbers = settings.stage_names, seeds.numbers(settings)
     steps = settings.arenas * settings.algo.rollout_length
     rows, lost = episodes.rows(log, updates, names, numbers, steps)
     record.write_episodes(rows)
@@ -499,7 +499,7 @@ def _log_episodes(
 
 def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
     """Returns the curriculum's decisions for all seeds, in the order of the updates."""
-    names, several = [stage.name for stage in settings.stage], settings.seeds
+    names, several = settings.stage_names, settings.seeds
     found = [
         entry
         for lane, seed in enumerate(seeds.numbers(settings))

@@ -66,10 +66,9 @@ class WandbRuns:
         """Writes the numbers of each row. The first seed's last row also gets the speeds."""
         mine = [row for row in rows if row["seed"] in self._seeds]
         last = [row for row in mine if row["seed"] == self._seeds[0]][-1]
-        stages = [stage.name for stage in self._settings.stage]
         for row in mine:
             told = row | speeds if row is last else row
-            self._of(row["seed"]).log(numbers(told, stages))
+            self._of(row["seed"]).log(numbers(told, self._settings.stage_names))
 
     def attach(self, name: str, path: Path, arena_steps: int) -> None:
         """Writes a PNG as an image, or a page as HTML, to the first seed's run."""

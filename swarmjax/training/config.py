@@ -110,6 +110,11 @@ class ProgramConfig(Section):
         return self.sim.robots if self.algo.policy == "independent" else 1
 
     @property
+    def stage_names(self) -> list[str]:
+        """Names of the stages, in their order."""
+        return [stage.name for stage in self.stage]
+
+    @property
     def numbers(self) -> range:
         """The seeds of a run, in the order of the seed axis."""
         return range(self.seed, self.seed + self.seeds)
