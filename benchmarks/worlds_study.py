@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -24,6 +25,9 @@ from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import engine_mjx
+from swarmjax.ppo.learner import LearnerState
+from swarmjax.run import checkpoint
+from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig, load_train
 from swarmjax.task import env
 from swarmjax.task.stage_config import StageConfig
@@ -69,6 +73,7 @@ Arm = Literal[
     "failure",
     "value_loss",
     "mutation",
+    "combined",
 ]
 ARMS: dict[Arm, list[str]] = {
     "hardest": _EVENLY,
@@ -85,6 +90,7 @@ ARMS: dict[Arm, list[str]] = {
         "curriculum.levels.mode=learnability",
         "curriculum.levels.mutation=0.3",
     ],
+    "combined": [*_BY_FAILURE, "curriculum.levels.mode=learnability"],
 }
 _PARTS = {
     "memory": ["algo.memory=gru"],
@@ -114,6 +120,9 @@ class Study(Section):
     levels: int = field(default=64, metadata=about("levels of each family", 1, 2**20))
     level_seed: int = field(default=5, metadata=about("of these levels", 0, MAX_COUNT))
     steps: int = field(default=3000, metadata=about("control steps of an episode", 1, 10**6))
+    policies: str | None = field(
+        default=None, metadata=about("directory for the final policies, one directory for each arm")
+    )
 
 
 def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
@@ -189,8 +198,45 @@ def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
     arms: list[tuple[Arm, TrainConfig]] = [(arm, load_arm(study, arm, words)) for arm in study.arms]
     for arm, trained in arms:
         at = points(study, trained)
-        curves = curriculum.measure(trained, at, load_judge(study, trained))
-        yield _line(study, arm, trained, at) | vars(curves)
+        line = _line(study, arm, trained, at)
+        judge = _Witness(line["arm"], load_judge(study, trained))
+        curves = curriculum.measure(trained, at, judge)
+        if study.policies is not None:
+            write_policies(Path(study.policies) / line["arm"], judge.learners, trained, int(at[-1]))
+        yield line | vars(curves)
+
+
+class _Witness:
+    """A judge that reports each result on stderr, and keeps the learners it judged last."""
+
+    learners: LearnerState
+
+    def __init__(self, name: str, judge: curriculum.Judge) -> None:
+        self._name = name
+        self._judge = judge
+
+    def __call__(self, learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
+        self.learners = learners
+        found = self._judge(learners)
+        arrived = np.mean([measures["all_reached"] for measures in found.values()])
+        sys.stderr.write(f"{self._name}: all robots arrive in {100 * arrived:.1f} % of levels\n")
+        return found
+
+
+def write_policies(folder: Path, learners: LearnerState, trained: TrainConfig, update: int) -> None:
+    """Writes the policy of each seed.
+
+    Args:
+      folder: The directory; it is created.
+      learners: Learners [N, L] of N seeds.
+      trained: The config of the arm.
+      update: The update that the learners come from.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    updates = np.full(trained.seeds, update)
+    leaves = checkpoint.to_leaves({"learners": learners, "update": updates})
+    for seed in seeds.numbers(trained):
+        write_policy(seed_path(folder / POLICY, trained, seed), leaves, trained, update, seed)
 
 
 def _line(study: Study, arm: Arm, trained: TrainConfig, at: np.ndarray) -> dict[str, Any]:

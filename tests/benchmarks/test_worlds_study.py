@@ -4,12 +4,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from sentences import refusal
 
 from benchmarks import key_value, worlds_study, worlds_table
 from benchmarks.worlds_study import Arm, Study
+from swarmjax.run.settings import load_train
+from swarmjax.training import mesh
+from swarmjax.training import program as programs
 
 
 @pytest.mark.parametrize("arm", worlds_study.ARMS)
@@ -57,6 +61,17 @@ def test_the_last_point_is_the_end() -> None:
 
 def test_an_unknown_arm_is_refused() -> None:
     assert "arms is 'best': give hardest, random" in refusal(key_value.load, Study, ["arms=best"])
+
+
+def test_the_policy_of_each_seed_is_written(tmp_path: Path) -> None:
+    trained = load_train(["stage=s1", "seeds=2", "arenas=8"])
+    program, schedule = programs.load(trained)
+    learners = jax.jit(mesh.init(program))(schedule).learners
+    worlds_study.write_policies(tmp_path / "arm", learners, trained, update=3)
+    expected = learners.params["actor"]["mean"]["kernel"]
+    for seed in range(2):
+        with np.load(tmp_path / "arm" / f"policy-seed{seed}.npz") as found:
+            assert (found["actor/mean/kernel"] == expected[seed]).all()
 
 
 def _line(arm: str, seeds: list[int], trap: list[list[float]], fence: list[list[float]]) -> Any:
