@@ -25,6 +25,12 @@ def test_it_is_that_of_a_stable_sort(distance: np.ndarray, data: st.DataObject) 
         np.testing.assert_array_equal(nearest(distance, count, xp), expected)
 
 
+def test_long_rows_have_the_same_order() -> None:
+    distance = np.random.default_rng(0).integers(0, 9, (2, 100)).astype(np.float32)
+    expected = np.argsort(distance, axis=-1, stable=True)[:, :50]
+    np.testing.assert_array_equal(jax.jit(lambda x: nearest(x, 50, jnp))(distance), expected)
+
+
 def test_jax_gives_the_same_order() -> None:
     distance = np.float32([[0.3, 0.1, np.inf, 0.1], [2.0, 1.0, 0.5, 0.0]])
     found = jax.jit(lambda x: nearest(x, 3, jnp))(distance)
