@@ -1,14 +1,16 @@
 """Makes tables from the lines that `benchmarks.worlds_study` has printed.
 
 `python -m benchmarks.worlds_table FILE...` prints two Markdown tables. The first table has a row
-for each arm, with interquartile means over seeds and families. Their 95 % intervals come from a
-stratified bootstrap (swarmjax.evaluate.statistics). The columns are:
+for each arm. Its intervals are 95 % intervals from a bootstrap over seeds
+(swarmjax.evaluate.statistics). A seed's score at a point is the share of levels in which all robots
+arrive, as a mean over the families. The columns are:
 
-- `all arrive`: share of levels in which all robots arrive, at the end of training.
-- `to 0.9`: arena steps until a seed's mean over the families first reaches 0.9.
+- `all arrive`: interquartile mean of the scores at the end.
+- `to 0.9`, `to 0.95`: arena steps until a seed first has this score; interquartile mean.
 - `worst 5 %`: mean of the worst twentieth of all results; each seed has one result for each family.
-- `contacts`: contacts per robot.
-- `P(better)`: probability that a seed does better on a family than a seed of `random`.
+- `contacts`: contacts per robot, as a mean over the families; interquartile mean over seeds.
+- `P(end)`: probability that a seed has a higher score at the end than a seed of `random`.
+- `P(area)`: probability that a seed has a higher mean score over all points.
 
 The second table has a row for each family and a column for each arm, with the mean of `all arrive`
 over seeds.
@@ -16,7 +18,7 @@ over seeds.
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,7 @@ from swarmjax.evaluate.statistics import Interval
 from swarmjax.run.settings import TrainConfig
 
 BASELINE = "random"
-THRESHOLD = 0.9
+THRESHOLDS = (0.9, 0.95)
 _KEYS = ("arm", "seeds", "arena_steps", "judged", "levels", "level_seed", "steps")
 _SHARED = ("arena_steps", "levels", "level_seed", "steps")
 
@@ -100,37 +102,53 @@ def curves(line: Line, measure: str) -> np.ndarray:
 
 def arms_table(arms: dict[str, Line]) -> str:
     """Makes the Markdown table of the arms."""
-    rows = ["| arm | all arrive | to 0.9 | worst 5 % | contacts | P(better) |"]
-    rows.append("|---|--:|--:|--:|--:|--:|")
+    columns = ["arm", "all arrive", *(f"to {share}" for share in THRESHOLDS)]
+    columns += ["worst 5 %", "contacts", "P(end)", "P(area)"]
+    rows = [f"| {' | '.join(columns)} |", f"|---|{'--:|' * (len(columns) - 1)}"]
     baseline = arms.get(BASELINE)
-    rows += [f"| {name} | {' | '.join(_cells(line, baseline))} |" for name, line in arms.items()]
+    for name, line in arms.items():
+        cells = [name, *_cells(line), *_chances(line, baseline)]
+        rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)
 
 
-def _cells(line: Line, baseline: Line | None) -> list[str]:
-    """Makes the table cells for the row of an arm."""
-    arrive = curves(line, "all_reached")
-    end, contacts = arrive[..., -1], curves(line, "contacts_per_robot")[..., -1]
-    to = steps_to(line["arena_steps"], arrive.mean(axis=1), THRESHOLD)
-    better = "-"
-    if baseline is not None and line is not baseline:
-        theirs = curves(baseline, "all_reached")[..., -1]
-        better = _words(statistics.probability_of_improvement(end, theirs))
-    return [
-        _words(statistics.bootstrap(end, statistics.iqm)),
-        _steps(float(statistics.iqm(to))),
-        _words(statistics.bootstrap(end, _worst)),
-        _words(statistics.bootstrap(contacts, statistics.iqm)),
-        better,
-    ]
+def _cells(line: Line) -> Iterator[str]:
+    """Yields the table cells of an arm's own results."""
+    arrive, contacts = curves(line, "all_reached"), curves(line, "contacts_per_robot")
+    score = arrive.mean(axis=1)
+    yield _words(_over_seeds(score[:, -1]), _share)
+    for share in THRESHOLDS:
+        yield _words(_over_seeds(steps_to(line["arena_steps"], score, share)), _steps)
+    yield _words(statistics.bootstrap(arrive[..., -1], _worst), _share)
+    yield _words(_over_seeds(contacts[..., -1].mean(axis=1)), _share)
+
+
+def _chances(line: Line, baseline: Line | None) -> Iterator[str]:
+    """Yields the cells of the probabilities that a seed of an arm beats one of the baseline."""
+    if baseline is None or line is baseline:
+        yield from ("-", "-")
+        return
+    ours, theirs = (curves(each, "all_reached").mean(axis=1) for each in (line, baseline))
+    for of in (ours[:, -1], theirs[:, -1]), (ours.mean(axis=1), theirs.mean(axis=1)):
+        one, other = (values[:, None] for values in of)
+        yield _words(statistics.probability_of_improvement(one, other), _share)
+
+
+def _over_seeds(values: np.ndarray) -> Interval[float]:
+    """Computes the interquartile mean of values [N], with its interval."""
+    return statistics.bootstrap(values[:, None], statistics.iqm)
 
 
 def _worst(values: np.ndarray, axis: tuple[int, ...]) -> np.ndarray:
     return np.asarray(statistics.cvar(values, axis=axis))
 
 
-def _words(found: Interval[float]) -> str:
-    return f"{found.estimate:.2f} [{found.low:.2f}, {found.high:.2f}]"
+def _words(found: Interval[float], word: Callable[[float], str]) -> str:
+    return f"{word(found.estimate)} [{word(found.low)}, {word(found.high)}]"
+
+
+def _share(share: float) -> str:
+    return f"{share:.3f}"
 
 
 def _steps(steps: float) -> str:

@@ -97,13 +97,15 @@ BETTER = _line("adaptive", [0, 1, 2], [[0.5, 1.0]] * 3, [[0.7, 1.0]] * 3)
 def test_arms_are_compared() -> None:
     found = worlds_table.arms_table(worlds_table.merge([BETTER, RANDOM])).splitlines()
     assert found[2] == (
-        "| random | 0.40 [0.40, 0.40] | never | 0.00 [0.00, 0.00] | 0.25 [0.25, 0.25] | - |"
+        "| random | 0.400 [0.400, 0.400] | never [never, never] | never [never, never] "
+        "| 0.000 [0.000, 0.000] | 0.250 [0.250, 0.250] | - | - |"
     )
     # The mean over the families rises from 0.6 to 1.0, and passes 0.9 after three quarters of the
     # steps between the two points.
     assert found[3] == (
-        "| adaptive | 1.00 [1.00, 1.00] | 1.8e+02 | 1.00 [1.00, 1.00] | 0.25 [0.25, 0.25] "
-        "| 1.00 [1.00, 1.00] |"
+        "| adaptive | 1.000 [1.000, 1.000] | 1.8e+02 [1.8e+02, 1.8e+02] "
+        "| 1.9e+02 [1.9e+02, 1.9e+02] | 1.000 [1.000, 1.000] | 0.250 [0.250, 0.250] "
+        "| 1.000 [1.000, 1.000] | 1.000 [1.000, 1.000] |"
     )
 
 
