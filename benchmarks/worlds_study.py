@@ -199,14 +199,14 @@ def results(study: Study, words: Sequence[str]) -> Iterator[dict[str, Any]]:
     for arm, trained in arms:
         at = points(study, trained)
         line = _line(study, arm, trained, at)
-        judge = _Witness(line["arm"], load_judge(study, trained))
+        judge = _ReportingJudge(line["arm"], load_judge(study, trained))
         curves = curriculum.measure(trained, at, judge)
         if study.policies is not None:
             write_policies(Path(study.policies) / line["arm"], judge.learners, trained, int(at[-1]))
         yield line | vars(curves)
 
 
-class _Witness:
+class _ReportingJudge:
     """A judge that reports each result on stderr, and keeps the learners it judged last."""
 
     learners: LearnerState

@@ -116,11 +116,11 @@ def _cells(line: Line) -> Iterator[str]:
     """Yields the table cells of an arm's own results."""
     arrive, contacts = curves(line, "all_reached"), curves(line, "contacts_per_robot")
     score = arrive.mean(axis=1)
-    yield _words(_over_seeds(score[:, -1]), _share)
+    yield _interval(_over_seeds(score[:, -1]), _decimals)
     for share in THRESHOLDS:
-        yield _words(_over_seeds(steps_to(line["arena_steps"], score, share)), _steps)
-    yield _words(statistics.bootstrap(arrive[..., -1], _worst), _share)
-    yield _words(_over_seeds(contacts[..., -1].mean(axis=1)), _share)
+        yield _interval(_over_seeds(steps_to(line["arena_steps"], score, share)), _steps)
+    yield _interval(statistics.bootstrap(arrive[..., -1], _worst), _decimals)
+    yield _interval(_over_seeds(contacts[..., -1].mean(axis=1)), _decimals)
 
 
 def _chances(line: Line, baseline: Line | None) -> Iterator[str]:
@@ -129,9 +129,9 @@ def _chances(line: Line, baseline: Line | None) -> Iterator[str]:
         yield from ("-", "-")
         return
     ours, theirs = (curves(each, "all_reached").mean(axis=1) for each in (line, baseline))
-    for of in (ours[:, -1], theirs[:, -1]), (ours.mean(axis=1), theirs.mean(axis=1)):
-        one, other = (values[:, None] for values in of)
-        yield _words(statistics.probability_of_improvement(one, other), _share)
+    for pair in (ours[:, -1], theirs[:, -1]), (ours.mean(axis=1), theirs.mean(axis=1)):
+        one, other = (values[:, None] for values in pair)
+        yield _interval(statistics.probability_of_improvement(one, other), _decimals)
 
 
 def _over_seeds(values: np.ndarray) -> Interval[float]:
@@ -143,16 +143,16 @@ def _worst(values: np.ndarray, axis: tuple[int, ...]) -> np.ndarray:
     return np.asarray(statistics.cvar(values, axis=axis))
 
 
-def _words(found: Interval[float], word: Callable[[float], str]) -> str:
-    return f"{word(found.estimate)} [{word(found.low)}, {word(found.high)}]"
+def _interval(found: Interval[float], show: Callable[[float], str]) -> str:
+    return f"{show(found.estimate)} [{show(found.low)}, {show(found.high)}]"
 
 
-def _share(share: float) -> str:
-    return f"{share:.3f}"
+def _decimals(value: float) -> str:
+    return f"{value:.3f}"
 
 
 def _steps(steps: float) -> str:
-    return "never" if np.isinf(steps) else f"{steps:.2g}"
+    return "never" if np.isinf(steps) else f"{steps:.1e}".replace("e+0", "e")
 
 
 def families_table(arms: dict[str, Line]) -> str:

@@ -6,6 +6,8 @@ import numpy as np
 
 Array = Any
 
+# The work of counting grows with the square of the number of objects, and the length of the
+# compiled program grows with the number.
 _MOST_COUNTED = 64
 
 
@@ -34,8 +36,8 @@ def nearest(distance: Array, count: int, xp: Any) -> Array:
 def _rank(distance: Array, xp: Any) -> Array:
     """Counts the objects that come before each object of [..., N].
 
-    The loop is unrolled on purpose. XLA's kernel for a sum of all comparisons is slow on a GPU:
-    with ten robots, it took 3 of the 8.6 ms of a control step in 20,480 arenas (H100).
+    The loop is unrolled because XLA's kernel for a sum of all comparisons is slow on a GPU: such
+    kernels took 4.9 of the 8.5 ms of a control step in 20,480 arenas (docs/performance.md).
     """
     import jax  # evaluation with NumPy runs without JAX
 

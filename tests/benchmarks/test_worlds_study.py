@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from sentences import refusal
 
 from benchmarks import key_value, worlds_study, worlds_table
 from benchmarks.worlds_study import Arm, Study
+from swarmjax import policy_file
 from swarmjax.run.settings import load_train
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
@@ -70,8 +71,19 @@ def test_the_policy_of_each_seed_is_written(tmp_path: Path) -> None:
     worlds_study.write_policies(tmp_path / "arm", learners, trained, update=3)
     expected = learners.params["actor"]["mean"]["kernel"]
     for seed in range(2):
-        with np.load(tmp_path / "arm" / f"policy-seed{seed}.npz") as found:
+        path = tmp_path / "arm" / f"policy-seed{seed}.npz"
+        assert policy_file.read_meta(path)["update"] == 3
+        with np.load(path) as found:
             assert (found["actor/mean/kernel"] == expected[seed]).all()
+
+
+def test_the_learners_that_were_judged_last_are_kept(capsys: pytest.CaptureFixture[str]) -> None:
+    shares = {"a": {"all_reached": np.array([0.5])}, "b": {"all_reached": np.array([1.0])}}
+    judge = worlds_study._ReportingJudge("random", lambda _: shares)
+    for learners in ("first", "last"):
+        assert judge(cast("Any", learners)) is shares
+    assert judge.learners == "last"
+    assert capsys.readouterr().err == 2 * "random: all robots arrive in 75.0 % of levels\n"
 
 
 def _line(arm: str, seeds: list[int], trap: list[list[float]], fence: list[list[float]]) -> Any:
@@ -92,21 +104,41 @@ def _line(arm: str, seeds: list[int], trap: list[list[float]], fence: list[list[
 
 RANDOM = _line("random", [0, 1, 2], [[0.0, 0.0]] * 3, [[0.5, 0.8]] * 3)
 BETTER = _line("adaptive", [0, 1, 2], [[0.5, 1.0]] * 3, [[0.7, 1.0]] * 3)
+# Two of three seeds end above those of RANDOM (0.4), and one has a higher mean over both points
+# (0.325).
+MIXED = _line(
+    "mixed", [0, 1, 2], [[0.0, 0.5], [0.0, 0.3], [0.2, 0.5]], [[0.0, 0.5], [0.5, 0.3], [0.3, 0.5]]
+)
 
 
-def test_arms_are_compared() -> None:
-    found = worlds_table.arms_table(worlds_table.merge([BETTER, RANDOM])).splitlines()
-    assert found[2] == (
-        "| random | 0.400 [0.400, 0.400] | never [never, never] | never [never, never] "
-        "| 0.000 [0.000, 0.000] | 0.250 [0.250, 0.250] | - | - |"
-    )
+def _rows(*lines: Any) -> list[list[str]]:
+    """Returns the cells of the table of arms."""
+    table = worlds_table.arms_table(worlds_table.merge(lines)).splitlines()[2:]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in table]
+
+
+def test_an_arm_has_its_own_results() -> None:
+    _, row = _rows(BETTER, RANDOM)
     # The mean over the families rises from 0.6 to 1.0, and passes 0.9 after three quarters of the
-    # steps between the two points.
-    assert found[3] == (
-        "| adaptive | 1.000 [1.000, 1.000] | 1.8e+02 [1.8e+02, 1.8e+02] "
-        "| 1.9e+02 [1.9e+02, 1.9e+02] | 1.000 [1.000, 1.000] | 0.250 [0.250, 0.250] "
-        "| 1.000 [1.000, 1.000] | 1.000 [1.000, 1.000] |"
-    )
+    # steps between the two points, and 0.95 after seven eighths.
+    assert row[:6] == [
+        "adaptive",
+        "1.000 [1.000, 1.000]",
+        "1.8e2 [1.8e2, 1.8e2]",
+        "1.9e2 [1.9e2, 1.9e2]",
+        "1.000 [1.000, 1.000]",
+        "0.250 [0.250, 0.250]",
+    ]
+
+
+def test_an_arm_that_never_gets_there_says_so() -> None:
+    assert _rows(RANDOM)[0][2] == "never [never, never]"
+
+
+def test_an_arm_is_compared_with_the_baseline() -> None:
+    baseline, row = _rows(MIXED, RANDOM)
+    assert baseline[6:] == ["-", "-"]
+    assert [cell.split()[0] for cell in row[6:]] == ["0.667", "0.333"]
 
 
 def test_families_are_compared() -> None:
