@@ -111,7 +111,7 @@ def _renew(settings: SuiteConfig) -> Suite:
         entrants = trials.read_policies(list_files("policies", settings.policies))
         wanted = tuple(_search(settings, each, entrants) for each in wanted)
     suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
-    path = files.suite_path(settings.suite)
+    path = files.named_path("suites", settings.suite, "suite")
     content = files.read_yaml(path)
     for entry, cell, chosen in zip(content["cells"], suite.cells, wanted, strict=True):
         entry["digest"] = cell.digest

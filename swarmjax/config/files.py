@@ -29,6 +29,9 @@ _MOST_DEPTH = 32  # nested brackets
 # fill the memory.
 _MOST_REFERENCES = 16
 
+# Groups whose message about an unknown choice says that a path is allowed.
+_OWN_FILES = ("stage", "recipes")
+
 # Takes the composed data and the choice of each group, and returns the keys and values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
@@ -227,18 +230,22 @@ def preset_of(group: str, held: Section) -> str:
     return "custom"
 
 
-def suite_path(choice: str) -> Path:
-    """Returns the file of a suite, given its name in configs/suites/ or its path.
+def named_path(folder: str, choice: str, key: str) -> Path:
+    """Returns the file that a choice names: one of a folder of configs/, or a user's own.
+
+    Args:
+      folder: a folder of configs/ that is not a group of Hydra.
+      choice: the name of a file in that folder, or the path of another file.
+      key: name of the setting in messages.
 
     Raises:
-      ConfigError: if there is no such suite.
+      ConfigError: if there is no such name.
     """
-    section.check_text("suite", choice)
-    path = Path(choice)
-    if path.suffix == ".yaml":
-        return path
-    check_choice("suites", choice, "suite")
-    return _config_dir() / "suites" / f"{choice}.yaml"
+    section.check_text(key, choice)
+    if is_path(choice):
+        return Path(choice)
+    check_choice(folder, choice, key)
+    return _config_dir() / folder / f"{choice}.yaml"
 
 
 def _example(group: str) -> str:
@@ -265,7 +272,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
         # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
         hint = f" (nearest: {near[0]})" if near else ""
-        file = ", or a file .yaml" if group == "stage" else ""
+        file = ", or a file .yaml" if group in _OWN_FILES else ""
         raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}{file}.")
 
 

@@ -93,7 +93,7 @@ def read_suite(choice: str) -> SuiteFileConfig:
     Raises:
       ConfigError: There is no such file, or it is unsound.
     """
-    path = files.suite_path(choice)
+    path = files.named_path("suites", choice, "suite")
     mapping = files.read_yaml(path)
     cells = mapping.get("cells")
     if isinstance(cells, list):

@@ -20,6 +20,7 @@ from swarmjax.config import (
 )
 from swarmjax.config.section import MAX_COUNT, modernise
 from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.task import mutation, pieces, stage_files
 from swarmjax.task.config import check_realism
@@ -139,6 +140,10 @@ class TrainConfig(ProgramConfig):
     command: ClassVar[str] = "train"
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
 
+    recipe: str | None = field(
+        default=None,
+        metadata=about("settings of a whole run, which other arguments override", stored=False),
+    )
     run: RunConfig = field(default_factory=RunConfig)
     resume: str | None = field(
         default=None,
@@ -375,7 +380,8 @@ def load_train(
         found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
         return mapping | {"stage": found, "stage_name": stage_files.name_of(chosen["stage"])}
 
-    return settle(files.load(TrainConfig, [*_inherited(overrides), *overrides], complete))
+    given = recipes.expand(TrainConfig, overrides)
+    return settle(files.load(TrainConfig, [*_inherited(given), *given], complete))
 
 
 # The algo keys that a run with init_from must share with the run that it starts from.
@@ -495,8 +501,11 @@ def load_run(
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
-    given = {key: value for key, _, value in (word.partition("=") for word in overrides)}
+    given = _by_key(overrides)
     resumed = given.get("resume", "null").strip("'\"")
+    if resumed in ("", "null", AUTO):
+        overrides = recipes.expand(TrainConfig, overrides)
+        given = _by_key(overrides)
     if resumed == AUTO:
         return _go_on_or_begin(overrides, given, stages)
     if resumed in ("", "null"):
@@ -506,6 +515,11 @@ def load_run(
     kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
     directory = settings.resume if kept else settings.run.dir
     return replace(settings, run=replace(settings.run, dir=directory)), False
+
+
+def _by_key(words: Sequence[str]) -> dict[str, str]:
+    """Returns the value of each key as typed; the last one counts."""
+    return {key: value for key, _, value in (word.partition("=") for word in words)}
 
 
 def _go_on_or_begin(
