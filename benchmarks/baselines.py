@@ -9,6 +9,11 @@ controller in MuJoCo C and prints a JSON line for each controller and cell. `sta
   (`benchmarks.bug2`).
 - `orca`, `hrvo`, `hl` and `social_force` use the positions of all robots and the map
   (`benchmarks.planners`). These four need the extra `navground`.
+
+`beside=a.npz,b.npz` also judges policies of one recipe, with the robot that they were trained with.
+Each line then compares the baseline with the policies, level by level: `difference` is the mean of
+the policies minus that of the baseline. To judge both with the same hulls, give
+`robot.hull_friction`.
 """
 
 import math
@@ -26,11 +31,12 @@ import numpy as np
 from benchmarks import bug2, key_value, peers, planners
 from swarmjax import command, epuck, policy_file, provenance, words
 from swarmjax.config import ConfigError, Section, about, show, to_dict
-from swarmjax.evaluate import cells, engine_c, measures, summary, trials
+from swarmjax.evaluate import cells, engine_c, measures, summary, trials, witness
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Controller
+from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
@@ -62,6 +68,10 @@ class BaselinesConfig(Section):
 
     who: tuple[str, ...] = field(
         default=("straight", "still", "bug2"), metadata=about("baselines, one after the other")
+    )
+    beside: str | None = field(
+        default=None,
+        metadata=about("policies to compare with: a.npz, several of one recipe, or a pattern"),
     )
 
     def _check(self) -> None:
@@ -129,12 +139,15 @@ def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
     policy_file.write(path, arrays, meta)
 
 
-def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, Any]]:
+def results(
+    who: Sequence[str], arguments: Sequence[str], beside: str | None = None
+) -> Iterator[dict[str, Any]]:
     """Judges baselines.
 
     Args:
       who: some of `NAMES`.
       arguments: keys of `evaluate`.
+      beside: policies to compare with, as `policy` of `evaluate` names them.
 
     Yields:
       A line for each baseline and each cell.
@@ -154,11 +167,52 @@ def results(who: Sequence[str], arguments: Sequence[str]) -> Iterator[dict[str, 
     workers = settings.workers or provenance.cores()
     jobs = [_split(settings, policies[name], name, cell, workers) for name, cell in pairs]
     flat = [job for mine in jobs for job in mine]
+    theirs = judge_policies(beside, arguments) if beside is not None else {}
     done = trials.work(_simulate, flat, min(workers, len(flat)))
     for (name, cell), mine in zip(pairs, jobs, strict=True):
         parts, seconds = zip(*(next(done) for _ in mine), strict=True)
         outcome = Outcome(*map(np.concatenate, zip(*parts, strict=True)))
-        yield _line(settings, suite.name, name, cell, outcome) | {"cpu_s": sum(seconds)}
+        mine = trials.specialise(settings, cell, settings.policy)
+        found = measures.per_level(outcome, settings.task.control_step, mine.step_limit)
+        line = _line(settings, suite.name, name, cell, found)
+        if beside is not None:
+            if cell.digest not in theirs:
+                raise ConfigError(f"beside is {beside}, which has other levels: give a stage.")
+            line |= {"beside": beside, "compared": compare(found, theirs[cell.digest])}
+        yield line | {"cpu_s": sum(seconds)}
+
+
+def judge_policies(beside: str, arguments: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Judges policies as `evaluate` does.
+
+    Args:
+      beside: the policies, as `policy` of `evaluate` names them.
+      arguments: keys of `evaluate`.
+
+    Returns:
+      The values [P, E] of each measure, by the digest of the cell.
+    """
+    settings, _ = witness.load(EvaluateConfig, [*arguments, f"policy={beside}"])
+    entrants = trials.read_policies(list_files("beside", beside), settings.extensions)
+    suite = cells.load(settings)
+    return {each.cell.digest: each.found for each in trials.run(settings, suite.cells, entrants)}
+
+
+def compare(
+    baseline: dict[str, np.ndarray], policies: dict[str, np.ndarray]
+) -> dict[str, dict[str, Any]]:
+    """Compares a baseline with policies, level by level.
+
+    Args:
+      baseline: values [E] of each measure.
+      policies: values [P, E] of each measure, on the same levels.
+
+    Returns:
+      For each measure that both have, the entries of `summary.compare`. The baseline is `a`.
+    """
+    count = len(next(iter(policies.values())))
+    repeated = {name: np.tile(values, (count, 1)) for name, values in baseline.items()}
+    return summary.compare(repeated, policies)
 
 
 def _read(who: Sequence[str], arguments: Sequence[str]) -> tuple[EvaluateConfig, dict[str, Policy]]:
@@ -203,11 +257,14 @@ def controller(who: str, judge: Judge) -> Controller | None:
 
 
 def _line(
-    settings: EvaluateConfig, suite: str | None, who: str, cell: Cell, outcome: Outcome
+    settings: EvaluateConfig,
+    suite: str | None,
+    who: str,
+    cell: Cell,
+    found: dict[str, np.ndarray],
 ) -> dict[str, Any]:
     """Returns a baseline's results on a cell as plain data for JSON."""
-    step, mine = settings.task.control_step, trials.specialise(settings, cell, settings.policy)
-    found = measures.per_level(outcome, step, mine.step_limit)
+    mine = trials.specialise(settings, cell, settings.policy)
     packages = ("navground", "scipy") if who in planners.SETTINGS else ()
     return {
         "benchmark": "baselines",
@@ -234,7 +291,7 @@ def _line(
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     mine, others = key_value.parse(BaselinesConfig, arguments)
-    peers.write(results(mine.who, others))
+    peers.write(results(mine.who, others, mine.beside))
     return 0
 
 

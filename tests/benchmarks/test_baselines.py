@@ -27,6 +27,32 @@ def test_a_line_says_who_where_and_what_came_of_it(capsys: pytest.CaptureFixture
     assert {"device", "versions", "commit", "digest"} <= lines[0].keys()
 
 
+def test_a_baseline_is_compared_with_policies_on_the_same_levels(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        baselines.write(tmp_path / f"{name}.npz", *baselines.POLICIES["straight"])
+    words = ["stage=s1", "episodes=3", "workers=1"]
+    (line,) = baselines.results(["still"], words, str(tmp_path / "*.npz"))
+    found = line["compared"]["targets_reached"]
+    assert (found["a"], found["b"]) == (0.0, 1.0)
+    assert (found["difference"], found["difference_interval"]) == (1.0, [1.0, 1.0])
+
+
+def test_policies_on_other_levels_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default stage is that of the policy, and a baseline has none."""
+    monkeypatch.setattr(baselines, "judge_policies", lambda *_: {"another digest": {}})
+    words = ["stage=s1", "episodes=1", "workers=1", "steps=1"]
+    with pytest.raises(ConfigError, match="which has other levels: give a stage"):
+        list(baselines.results(["still"], words, "a.npz"))
+
+
+def test_values_of_each_level_are_paired() -> None:
+    """The difference is the same on each level, so resampling levels does not change it."""
+    baseline = {"all_reached": np.array([0.0, 0.25, 0.5, 0.75])}
+    policies = {"all_reached": np.stack([baseline["all_reached"] + 0.25] * 3)}
+    found = baselines.compare(baseline, policies)["all_reached"]
+    assert found["difference_interval"] == [0.25, 0.25]
+
+
 @pytest.mark.parametrize(
     ("bearing", "action"), [(0.0, [1.0, 0.0]), (0.3, [0.4, 0.6]), (-0.25, [0.5, -0.5])]
 )
