@@ -167,34 +167,40 @@ def results(
     workers = settings.workers or provenance.cores()
     jobs = [_split(settings, policies[name], name, cell, workers) for name, cell in pairs]
     flat = [job for mine in jobs for job in mine]
-    theirs = judge_policies(beside, arguments) if beside is not None else {}
+    theirs = {} if beside is None else judge_policies(beside, arguments, suite.cells)
     done = trials.work(_simulate, flat, min(workers, len(flat)))
-    for (name, cell), mine in zip(pairs, jobs, strict=True):
-        parts, seconds = zip(*(next(done) for _ in mine), strict=True)
+    for (name, cell), batches in zip(pairs, jobs, strict=True):
+        parts, seconds = zip(*(next(done) for _ in batches), strict=True)
         outcome = Outcome(*map(np.concatenate, zip(*parts, strict=True)))
         mine = trials.specialise(settings, cell, settings.policy)
         found = measures.per_level(outcome, settings.task.control_step, mine.step_limit)
-        line = _line(settings, suite.name, name, cell, found)
+        line = _line(mine, suite.name, name, cell, found)
         if beside is not None:
-            if cell.digest not in theirs:
-                raise ConfigError(f"beside is {beside}, which has other levels: give a stage.")
             line |= {"beside": beside, "compared": compare(found, theirs[cell.digest])}
         yield line | {"cpu_s": sum(seconds)}
 
 
-def judge_policies(beside: str, arguments: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+def judge_policies(
+    beside: str, arguments: Sequence[str], baseline_cells: Sequence[Cell]
+) -> dict[str, dict[str, np.ndarray]]:
     """Judges policies as `evaluate` does.
 
     Args:
       beside: the policies, as `policy` of `evaluate` names them.
       arguments: keys of `evaluate`.
+      baseline_cells: the cells on which the baselines are judged.
 
     Returns:
       The values [P, E] of each measure, by the digest of the cell.
+
+    Raises:
+      ConfigError: if the policies would be judged on other levels.
     """
     settings, _ = witness.load(EvaluateConfig, [*arguments, f"policy={beside}"])
     entrants = trials.read_policies(list_files("beside", beside), settings.extensions)
     suite = cells.load(settings)
+    if {cell.digest for cell in suite.cells} != {cell.digest for cell in baseline_cells}:
+        raise ConfigError(f"beside is {beside}, which has other levels: give a stage.")
     return {each.cell.digest: each.found for each in trials.run(settings, suite.cells, entrants)}
 
 
@@ -263,8 +269,7 @@ def _line(
     cell: Cell,
     found: dict[str, np.ndarray],
 ) -> dict[str, Any]:
-    """Returns a baseline's results on a cell as plain data for JSON."""
-    mine = trials.specialise(settings, cell, settings.policy)
+    """Returns a baseline's results on a cell as plain data for JSON; settings are the cell's."""
     packages = ("navground", "scipy") if who in planners.SETTINGS else ()
     return {
         "benchmark": "baselines",
@@ -273,14 +278,14 @@ def _line(
         "cell": cell.name,
         "stage": to_dict(cell.stage),
         "shape": cell.shape,
-        "realism": to_dict(mine.realism),
+        "realism": to_dict(settings.realism),
         "episodes": len(cell.episodes),
         "seed": cell.seed,
         "digest": cell.digest,
         "measures": summary.summarize({name: table[None] for name, table in found.items()}),
-        "robot": to_dict(mine.robot),
+        "robot": to_dict(settings.robot),
         "task": to_dict(settings.task),
-        "steps": mine.step_limit,
+        "steps": settings.step_limit,
         "substeps": evaluate_judge.substeps(settings),
         "device": f"CPU {platform.machine()}, {words.count(provenance.cores(), 'core')}",
         "versions": peers.versions(*packages),

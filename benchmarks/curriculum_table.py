@@ -170,7 +170,7 @@ def _cells(mine: Figures) -> Iterator[str]:
     yield _share(mine.goal)
     yield _share(mine.held_out)
     for steps in mine.steps.values():
-        yield _words(_over_seeds(steps), _count)
+        yield _words(over_seeds(steps), _count)
     for values in (mine.area, mine.log_area, mine.forgotten):
         yield _share(values)
 
@@ -180,18 +180,22 @@ def _chances(mine: Figures, baseline: Figures | None) -> Iterator[str]:
     if baseline is None:
         return
     for name in ("goal", "area"):
-        ours, theirs = (getattr(each, name)[:, None] for each in (mine, baseline))
-        chance = statistics.probability_of_improvement(ours, theirs)
+        chance = chance_of_seeds(getattr(mine, name), getattr(baseline, name))
         yield "-" if mine is baseline else _words(chance, "{:.2f}".format)
 
 
-def _over_seeds(values: np.ndarray) -> Interval[float]:
+def chance_of_seeds(ours: np.ndarray, theirs: np.ndarray) -> Interval[float]:
+    """Computes the probability that a value of ours [N] is higher than one of theirs [M]."""
+    return statistics.probability_of_improvement(ours[:, None], theirs[:, None])
+
+
+def over_seeds(values: np.ndarray) -> Interval[float]:
     """Computes the interquartile mean of values [N], with the mean's interval."""
     return statistics.bootstrap(values[:, None], statistics.iqm)
 
 
 def _share(values: np.ndarray | None) -> str:
-    return "-" if values is None else _words(_over_seeds(values), "{:.3f}".format)
+    return "-" if values is None else _words(over_seeds(values), "{:.3f}".format)
 
 
 def _count(steps: float) -> str:

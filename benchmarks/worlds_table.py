@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.curriculum_table import chance_of_seeds, over_seeds
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import statistics
@@ -116,11 +117,11 @@ def _cells(line: Line) -> Iterator[str]:
     """Yields the table cells of an arm's own results."""
     arrive, contacts = curves(line, "all_reached"), curves(line, "contacts_per_robot")
     score = arrive.mean(axis=1)
-    yield _interval(_over_seeds(score[:, -1]), _decimals)
+    yield _interval(over_seeds(score[:, -1]), _decimals)
     for share in THRESHOLDS:
-        yield _interval(_over_seeds(steps_to(line["arena_steps"], score, share)), _steps)
+        yield _interval(over_seeds(steps_to(line["arena_steps"], score, share)), _steps)
     yield _interval(statistics.bootstrap(arrive[..., -1], _worst), _decimals)
-    yield _interval(_over_seeds(contacts[..., -1].mean(axis=1)), _decimals)
+    yield _interval(over_seeds(contacts[..., -1].mean(axis=1)), _decimals)
 
 
 def _chances(line: Line, baseline: Line | None) -> Iterator[str]:
@@ -129,14 +130,8 @@ def _chances(line: Line, baseline: Line | None) -> Iterator[str]:
         yield from ("-", "-")
         return
     ours, theirs = (curves(each, "all_reached").mean(axis=1) for each in (line, baseline))
-    for pair in (ours[:, -1], theirs[:, -1]), (ours.mean(axis=1), theirs.mean(axis=1)):
-        one, other = (values[:, None] for values in pair)
-        yield _interval(statistics.probability_of_improvement(one, other), _decimals)
-
-
-def _over_seeds(values: np.ndarray) -> Interval[float]:
-    """Computes the interquartile mean of values [N], with its interval."""
-    return statistics.bootstrap(values[:, None], statistics.iqm)
+    yield _interval(chance_of_seeds(ours[:, -1], theirs[:, -1]), _decimals)
+    yield _interval(chance_of_seeds(ours.mean(axis=1), theirs.mean(axis=1)), _decimals)
 
 
 def _worst(values: np.ndarray, axis: tuple[int, ...]) -> np.ndarray:

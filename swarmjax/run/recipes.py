@@ -7,26 +7,25 @@ from typing import Any
 from swarmjax.config import files
 from swarmjax.config.section import ConfigError, Section
 
-RECIPES = "recipes"
-
 
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
-    """Puts the words of the recipe, if there is one, before the typed words, which override them.
+    """Replaces `recipe=NAME` by the words of the recipe. Typed words override them.
 
     Args:
       cls: the command's dataclass.
       typed: `key=value` words.
 
     Returns:
-      The words of the recipe, and then the typed words.
+      The words of the recipe, and then the other typed words.
 
     Raises:
       ConfigError: if there is no such recipe, or its file is invalid.
     """
+    others = [word for word in typed if not word.startswith("recipe=")]
     chosen = [files.choice_of(word) for word in typed if word.startswith("recipe=")]
     if not chosen or chosen[-1] in ("", "null"):
-        return list(typed)
-    path = files.named_path(RECIPES, chosen[-1], "recipe")
+        return others
+    path = files.named_path("recipes", chosen[-1], "recipe")
     found = files.read_yaml(path)
     if "recipe" in found:
         raise ConfigError(f"{path} names another recipe: remove the key recipe.")
@@ -35,7 +34,7 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
         files.split_words(cls, words)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    return [*words, *typed]
+    return [*words, *others]
 
 
 def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:

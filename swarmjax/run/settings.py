@@ -140,6 +140,7 @@ class TrainConfig(ProgramConfig):
     command: ClassVar[str] = "train"
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
 
+    # `recipes.expand` replaces this word by the recipe's words, so no config holds it.
     recipe: str | None = field(
         default=None,
         metadata=about("settings of a whole run, which other arguments override", stored=False),
@@ -501,20 +502,23 @@ def load_run(
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
+    resumed = _by_key(overrides).get("resume", "null").strip("'\"")
+    if resumed not in ("", "null", AUTO):
+        return _go_on(Path(resumed), overrides), False
+    overrides = recipes.expand(TrainConfig, overrides)
     given = _by_key(overrides)
-    resumed = given.get("resume", "null").strip("'\"")
-    if resumed in ("", "null", AUTO):
-        overrides = recipes.expand(TrainConfig, overrides)
-        given = _by_key(overrides)
     if resumed == AUTO:
         return _go_on_or_begin(overrides, given, stages)
-    if resumed in ("", "null"):
-        auto = given.get("arenas", "").strip("'\"") == AUTO
-        return load_train(overrides, auto=auto, stages=stages), auto
-    settings = load_resume(read_config(Path(resumed)), overrides)
-    kept = given.get("run.dir", "null") in ("", "null") or settings.run.dir is None
-    directory = settings.resume if kept else settings.run.dir
-    return replace(settings, run=replace(settings.run, dir=directory)), False
+    auto = given.get("arenas", "").strip("'\"") == AUTO
+    return load_train(overrides, auto=auto, stages=stages), auto
+
+
+def _go_on(run: Path, overrides: Sequence[str]) -> TrainConfig:
+    """Makes the configuration with which the run in a directory goes on."""
+    settings = load_resume(read_config(run), overrides)
+    asked = _by_key(overrides).get("run.dir", "null") not in ("", "null")
+    directory = settings.run.dir if asked else None
+    return replace(settings, run=replace(settings.run, dir=directory or settings.resume))
 
 
 def _by_key(words: Sequence[str]) -> dict[str, str]:

@@ -46,5 +46,5 @@ def _rank(distance: Array, xp: Any) -> Array:
         far = distance[..., other, None]
         nearer = (far < distance) | ((far == distance) & (other < index))
         rank = rank + nearer.astype(xp.int32)
-    # Otherwise XLA counts anew for each of the objects that are returned.
+    # Without the barrier, XLA repeats the count for each object that is returned.
     return jax.lax.optimization_barrier(rank)

@@ -11,7 +11,9 @@ from benchmarks import baselines
 from swarmjax import exit_codes, policy, policy_file
 from swarmjax.command import run
 from swarmjax.config import ConfigError
+from swarmjax.evaluate import cells
 from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.task.stage_files import load_levels
 
 
 def test_a_line_says_who_where_and_what_came_of_it(capsys: pytest.CaptureFixture[str]) -> None:
@@ -37,12 +39,13 @@ def test_a_baseline_is_compared_with_policies_on_the_same_levels(tmp_path: Path)
     assert (found["difference"], found["difference_interval"]) == (1.0, [1.0, 1.0])
 
 
-def test_policies_on_other_levels_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_policies_on_other_levels_are_refused(tmp_path: Path) -> None:
     """The default stage is that of the policy, and a baseline has none."""
-    monkeypatch.setattr(baselines, "judge_policies", lambda *_: {"another digest": {}})
-    words = ["stage=s1", "episodes=1", "workers=1", "steps=1"]
+    baselines.write(tmp_path / "a.npz", *baselines.POLICIES["straight"])
+    policy_word = f"policy={tmp_path / 'a.npz'}"
+    others = cells.load(load_levels(EvaluateConfig, ["stage=s2", "episodes=1", policy_word])).cells
     with pytest.raises(ConfigError, match="which has other levels: give a stage"):
-        list(baselines.results(["still"], words, "a.npz"))
+        baselines.judge_policies(str(tmp_path / "a.npz"), ["stage=s1", "episodes=1"], others)
 
 
 def test_values_of_each_level_are_paired() -> None:
