@@ -147,8 +147,10 @@ def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
 
 
 def _hardest(stage: StageConfig) -> StageConfig:
-    """Returns a stage with the obstacle sizes of the suite `worlds`."""
-    return replace(stage, **HARDEST.get(stage.level, {}))
+    """Returns a stage whose ranges of sizes are replaced by the sizes of the suite `worlds`."""
+    sizes = HARDEST.get(stage.level, {})
+    ranges = [name for name in sizes if isinstance(getattr(stage, name), tuple)]
+    return replace(stage, **{name: sizes[name] for name in ranges})
 
 
 def points(study: Study, trained: TrainConfig) -> np.ndarray:

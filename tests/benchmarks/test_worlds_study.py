@@ -51,6 +51,13 @@ def test_only_the_arm_without_curriculum_has_the_sizes_that_are_judged() -> None
     assert isinstance(worlds_study.load_arm(Study(), "random", []).stage[0].depth, tuple)
 
 
+def test_a_size_that_is_no_range_is_kept(tmp_path: Path) -> None:
+    stage = tmp_path / "deep.yaml"
+    stage.write_text("{level: trap, robots: 1, side: 1.6, width: [0.3, 0.8], depth: 0.7}")
+    hardest = worlds_study.load_arm(Study(without="messages"), "hardest", [f"stage={stage}"])
+    assert (hardest.stage[0].width, hardest.stage[0].depth) == (0.3, 0.7)
+
+
 def test_the_last_point_is_the_end() -> None:
     words = ["budget=5e6", "arenas=8192"]  # 9 updates of 524,288 arena steps
     config = worlds_study.load_arm(Study(), "random", words)
