@@ -273,6 +273,12 @@ class TrainConfig(ProgramConfig):
                 "choose one, task.history=1 or algo.memory=none."
             )
         self._check_hearing()
+        if self.task.team_reward and self.algo.advantage == "monte_carlo":
+            raise ConfigError(
+                f"task.team_reward is {show(self.task.team_reward)}, but algo.advantage is "
+                "monte_carlo, which knows nothing of the rewards after a robot's arrival: give "
+                "algo.advantage=gae or task.team_reward=0."
+            )
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
                 f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "

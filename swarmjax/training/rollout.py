@@ -21,7 +21,7 @@ from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import begin_memory
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
-from swarmjax.task import env, extended, level
+from swarmjax.task import env, extended, level, team
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
@@ -342,6 +342,7 @@ def _step(
     if memory is not None and judged.memory is not None:
         arenas = replace(arenas, recall=Recall(memory, to_arenas(judged.memory)))
     reached = _judge(program, learners, arenas)
+    reward = _with_team(program, arenas, came, to_arenas(reached.value))
     ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, first = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
@@ -352,7 +353,7 @@ def _step(
         log_prob=log_prob,
         value=judged.value,
         next_value=reached.value,
-        reward=to_learners(came.reward, count),
+        reward=to_learners(reward, count),
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
@@ -361,6 +362,30 @@ def _step(
     )
     carry = (arenas, _pick(over, first, reached), begun + came.done)
     return carry, (transition, _to_counts(ended))
+
+
+def _with_team(program: Program, arenas: Arena, came: env.TimeStep, value: Array) -> Array:
+    """Returns the rewards of a step, [A, R], for learning.
+
+    A robot that arrives has no further samples. So it is paid at once what it expects of the
+    rewards that its team still earns.
+
+    Args:
+      program: the program.
+      arenas: [A] after the step, before any reset.
+      came: [A] results of the step.
+      value: [A, R] values after the step.
+    """
+    part = program.world.task.team_reward
+    if not part:
+        return came.reward
+    present = arenas.level.present
+    later = jax.vmap(functools.partial(team.still_earned, part=part))(
+        value, present & ~arenas.arrived, present
+    )
+    return came.reward + jnp.where(
+        came.terminated, program.config.algo.discount * later[:, None], 0.0
+    )
 
 
 def _act(

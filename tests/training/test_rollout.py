@@ -245,6 +245,31 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
         np.testing.assert_allclose(found.advantage[learner], advantage.T, atol=5e-6)
 
 
+# --- shared rewards
+
+
+def test_a_robot_that_arrives_is_paid_its_part_of_what_the_team_still_earns(
+    program: Program, run: Run
+) -> None:
+    part = 0.5
+    task = dataclasses.replace(program.world.task, team_reward=part)
+    sharing = dataclasses.replace(program, world=dataclasses.replace(program.world, task=task))
+    _, shared, _ = jax.jit(functools.partial(rollout.collect, sharing))(
+        run.learners, run.before, run.starts, jax.random.key(2)
+    )
+    alone = run.trajectory  # the same actions
+    pick = np.s_[:, 0, ARRIVES]  # [T, R], all robots of which are present
+    own, value, arrives = (x[pick] for x in (alone.reward, alone.next_value, alone.terminated))
+    under_way = alone.valid[pick] & ~arrives
+    total = (value * under_way).sum(axis=-1) / (1 - part + part * under_way.mean(axis=-1))
+    expected = (1 - part) * own + part * own.mean(axis=-1, keepdims=True)
+    expected += arrives * program.config.algo.discount * part * total[:, None] / ROBOTS
+    used = alone.valid[pick]
+    assert (arrives & (under_way.sum(axis=-1) > 0)[:, None]).any(), "one arrives before another"
+    np.testing.assert_allclose(np.asarray(shared.reward)[pick][used], expected[used], atol=1e-6)
+    np.testing.assert_array_equal(shared.terminated, alone.terminated)
+
+
 # --- episodes that wait
 
 
