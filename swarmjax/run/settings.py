@@ -273,11 +273,12 @@ class TrainConfig(ProgramConfig):
                 "choose one, task.history=1 or algo.memory=none."
             )
         self._check_hearing()
-        if self.task.team_reward and self.algo.advantage == "monte_carlo":
+        latch, returns = self.task.arrival == "latch", self.algo.advantage == "monte_carlo"
+        if self.algo.team_reward and latch and returns:
             raise ConfigError(
-                f"task.team_reward is {show(self.task.team_reward)}, but algo.advantage is "
-                "monte_carlo, which knows nothing of the rewards after a robot's arrival: give "
-                "algo.advantage=gae or task.team_reward=0."
+                f"algo.team_reward is {show(self.algo.team_reward)}, but algo.advantage is "
+                "monte_carlo and task.arrival is latch, so returns end at a robot's arrival: give "
+                "algo.advantage=gae, task.arrival=hold or algo.team_reward=0."
             )
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(

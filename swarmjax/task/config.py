@@ -135,10 +135,6 @@ class TaskConfig(Section):
     )
     neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
-    team_reward: float = field(
-        default=0.0,
-        metadata=about("part of a robot's reward that is the mean over its arena", 0.0, 1.0),
-    )
 
     def _check(self) -> None:
         if self.history > 1 and self.neighbours.count:

@@ -30,7 +30,6 @@ from swarmjax.task import (
     reward,
     room,
     surroundings,
-    team,
 )
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
@@ -309,7 +308,6 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     sound &= _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
-    paid = jnp.where(valid, _share(world, gained, level.present), 0.0)
     # Learning skips the step of a broken arena, so the critic need not see it either.
     seen = jnp.where(sound, observation.stack(seen, state.observation, jnp), state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
@@ -328,20 +326,13 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     )
     return new, TimeStep(
         observation=seen,
-        reward=paid,
+        reward=gained,
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
         done=complete | timeout | ~sound,
         sound=sound,
     )
-
-
-def _share(world: World, gained: Array, present: Array) -> Array:
-    """Returns what each robot is paid, [R], if the team shares its rewards."""
-    if not world.task.team_reward:
-        return gained
-    return team.share(gained, present, world.task.team_reward)
 
 
 def _arrive(

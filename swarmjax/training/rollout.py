@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.ppo import gae, monte_carlo
+from swarmjax.ppo import gae, monte_carlo, team
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
@@ -21,7 +21,7 @@ from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import begin_memory
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
-from swarmjax.task import env, extended, level, team
+from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
@@ -62,7 +62,7 @@ class Trajectory(NamedTuple):
       log_prob: of the action.
       value: of the observation.
       next_value: value of the observation after the step, before any reset.
-      reward: of the step.
+      reward: of the step, shared by the team with `algo.team_reward`.
       terminated: whether the robot arrived in this step; with `task.arrival=hold`, whether all
         robots were on their targets at once.
       truncated: whether the time ran out for the robot.
@@ -342,7 +342,7 @@ def _step(
     if memory is not None and judged.memory is not None:
         arenas = replace(arenas, recall=Recall(memory, to_arenas(judged.memory)))
     reached = _judge(program, learners, arenas)
-    reward = _with_team(program, arenas, came, to_arenas(reached.value))
+    reward = _shared(config, arenas, came, to_arenas(reached.value))
     ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, first = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
@@ -364,28 +364,24 @@ def _step(
     return carry, (transition, _to_counts(ended))
 
 
-def _with_team(program: Program, arenas: Arena, came: env.TimeStep, value: Array) -> Array:
-    """Returns the rewards of a step, [A, R], for learning.
-
-    A robot that arrives has no further samples. So it is paid at once what it expects of the
-    rewards that its team still earns.
+def _shared(config: AlgoConfig, arenas: Arena, came: env.TimeStep, value: Array) -> Array:
+    """Returns the rewards to learn from, [A, R].
 
     Args:
-      program: the program.
+      config: settings of the algorithm.
       arenas: [A] after the step, before any reset.
       came: [A] results of the step.
       value: [A, R] values after the step.
     """
-    part = program.world.task.team_reward
+    part = config.team_reward
     if not part:
         return came.reward
     present = arenas.level.present
-    later = jax.vmap(functools.partial(team.still_earned, part=part))(
-        value, present & ~arenas.arrived, present
-    )
-    return came.reward + jnp.where(
-        came.terminated, program.config.algo.discount * later[:, None], 0.0
-    )
+    later = team.still_paid(value, present & ~arenas.arrived, present, part)
+    if config.time_out == "terminal":  # then the returns of the others end here too
+        later = jnp.where(came.done[:, None], 0.0, later)
+    last = jnp.where(came.terminated, config.discount * later, 0.0)
+    return team.share(came.reward, present, part) + last
 
 
 def _act(

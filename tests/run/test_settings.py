@@ -249,9 +249,10 @@ def test_import_needs_neither_jax_nor_hydra():
          "choose one, task.history=1 or algo.memory=none."),
         (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
          "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
-        (["task.team_reward=0.5", "algo.advantage=monte_carlo"],
-         "task.team_reward is 0.5, but algo.advantage is monte_carlo, which knows nothing of the "
-         "rewards after a robot's arrival: give algo.advantage=gae or task.team_reward=0."),
+        (["algo.team_reward=0.5", "algo.advantage=monte_carlo"],
+         "algo.team_reward is 0.5, but algo.advantage is monte_carlo and task.arrival is latch, so "
+         "returns end at a robot's arrival: give algo.advantage=gae, task.arrival=hold or "
+         "algo.team_reward=0."),
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
         (["task.neighbours.count=2", "task.history=3"], "task.history is 3, but neighbours.count "
          "is 2: choose one, history=1 or neighbours.count=0; neighbours work with "

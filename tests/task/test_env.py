@@ -393,21 +393,6 @@ def test_leaning_is_charged_in_every_step(
     np.testing.assert_allclose(charged, -0.5 * leans, atol=1e-5)
 
 
-def test_a_team_shares_what_its_robots_earn(
-    tiny_world: World, start: EnvState, actions: np.ndarray, episode: Episode
-) -> None:
-    task = dataclasses.replace(tiny_world.task, team_reward=0.25)
-    step = functools.partial(env.step, dataclasses.replace(tiny_world, task=task))
-    state = jax.tree.map(lambda x: x[PUSHING], start)
-    drive = jax.jit(lambda state, chosen: jax.lax.scan(step, state, chosen))
-    came = drive(state, jnp.asarray(actions[:, PUSHING]))[1]
-    own, present = episode.came.reward[:, PUSHING], np.asarray(start.level.present[PUSHING])
-    mean = own[:, present].mean(axis=-1, keepdims=True)
-    expected = np.where(episode.came.valid[:, PUSHING], 0.75 * own + 0.25 * mean, 0.0)
-    # 1e-5 covers the rounding of another program, which contacts multiply.
-    np.testing.assert_allclose(came.reward, expected, atol=1e-5)
-
-
 # --- one arena and the others
 
 

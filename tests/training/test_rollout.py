@@ -248,26 +248,45 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
 # --- shared rewards
 
 
-def test_a_robot_that_arrives_is_paid_its_part_of_what_the_team_still_earns(
-    program: Program, run: Run
+def _almost_there(before: Arena) -> Arena:
+    """Returns arenas of two robots, where one arrives first, in 6 when the time runs out."""
+    pose, target = before.level.start[:, 0], before.level.target
+    ahead = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
+    for arena in (4, 6):
+        target = target.at[arena, 0].set(pose[arena, :2] + 0.0501 * ahead[arena])
+    clock = before.clock.at[6].set(LIMIT - 1)
+    return dataclasses.replace(before, level=before.level._replace(target=target), clock=clock)
+
+
+@pytest.mark.parametrize("time_out", ["bootstrap", "terminal"])
+def test_a_robot_that_arrives_is_paid_its_share_of_what_the_others_still_earn(
+    program: Program, run: Run, time_out: Any
 ) -> None:
-    part = 0.5
-    task = dataclasses.replace(program.world.task, team_reward=part)
-    sharing = dataclasses.replace(program, world=dataclasses.replace(program.world, task=task))
-    _, shared, _ = jax.jit(functools.partial(rollout.collect, sharing))(
-        run.learners, run.before, run.starts, jax.random.key(2)
-    )
-    alone = run.trajectory  # the same actions
-    pick = np.s_[:, 0, ARRIVES]  # [T, R], all robots of which are present
-    own, value, arrives = (x[pick] for x in (alone.reward, alone.next_value, alone.terminated))
-    under_way = alone.valid[pick] & ~arrives
-    total = (value * under_way).sum(axis=-1) / (1 - part + part * under_way.mean(axis=-1))
-    expected = (1 - part) * own + part * own.mean(axis=-1, keepdims=True)
-    expected += arrives * program.config.algo.discount * part * total[:, None] / ROBOTS
-    used = alone.valid[pick]
-    assert (arrives & (under_way.sum(axis=-1) > 0)[:, None]).any(), "one arrives before another"
-    np.testing.assert_allclose(np.asarray(shared.reward)[pick][used], expected[used], atol=1e-6)
-    np.testing.assert_array_equal(shared.terminated, alone.terminated)
+    part, discount, before = 0.5, 0.5, _almost_there(run.before)
+
+    def collect(**settings: Any) -> tuple[Trajectory, Ended]:
+        algo = dataclasses.replace(program.config.algo, time_out=time_out, **settings)
+        mine = dataclasses.replace(program, config=dataclasses.replace(program.config, algo=algo))
+        found = jax.jit(functools.partial(rollout.collect, mine))
+        key = jax.random.key(2)
+        return jax.tree.map(np.asarray, found(run.learners, before, run.starts, key)[1:])
+
+    alone, ended = collect()
+    shared, _ = collect(team_reward=part, discount=discount)
+    np.testing.assert_array_equal(shared.action, alone.action)
+    for arena, robots in ((ARRIVES, 3), (4, 2), (6, 2)):
+        pick = np.s_[:, 0, arena, :robots]
+        own, value, used = (x[pick] for x in (alone.reward, alone.next_value, alone.valid))
+        arrives = alone.terminated[pick] & used
+        under_way = used & ~arrives
+        total = (value * under_way).sum(axis=-1) / (1 - part + part * under_way.mean(axis=-1))
+        over = ended.episodes[:, arena].astype(bool) & (time_out == "terminal")
+        last = np.where(over, 0.0, discount * part * total / robots)
+        expected = (1 - part) * own + part * own.mean(axis=-1, keepdims=True)
+        expected += np.where(arrives, last[:, None], 0.0)
+        assert (arrives & under_way.any(axis=-1)[:, None]).any(), "one arrives before another"
+        # 32-bit numbers of order 1 in another order.
+        np.testing.assert_allclose(shared.reward[pick][used], expected[used], atol=1e-6)
 
 
 # --- episodes that wait

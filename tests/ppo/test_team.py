@@ -1,13 +1,12 @@
 """Tests shared rewards against returns that are worked out step by step."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmjax.task import team
+from swarmjax.ppo import team
 
 
 def test_a_reward_is_mixed_with_the_mean_of_the_robots_that_are_present() -> None:
@@ -37,7 +36,7 @@ def test_what_an_arrived_robot_still_gets_follows_from_the_values_of_the_others(
         value = weight @ paid[now:]  # of all robots, also of those that have arrived
         left = under_way[now]
         present = jnp.ones(4, bool)
-        found = team.still_earned(jnp.asarray(value), jnp.asarray(left), present, part)
+        found = team.still_paid(jnp.asarray(value), jnp.asarray(left), present, part)
         arrived = value[~left]
         # 32-bit sums of at most 24 numbers of order 1, divided by at least 1 / 4.
         np.testing.assert_allclose(np.full(arrived.shape, found), arrived, atol=2e-5)
@@ -45,12 +44,12 @@ def test_what_an_arrived_robot_still_gets_follows_from_the_values_of_the_others(
 
 def test_nothing_is_left_once_all_have_arrived() -> None:
     value, nobody = jnp.array([1.0, jnp.nan]), jnp.zeros(2, bool)
-    assert float(team.still_earned(value, nobody, jnp.ones(2, bool), 1.0)) == 0.0
+    assert team.still_paid(value, nobody, jnp.ones(2, bool), 1.0).tolist() == [0.0]
 
 
-def test_a_batch_of_arenas_can_be_valued() -> None:
+def test_arenas_are_valued_each_by_itself() -> None:
     value = jnp.array([[1.0, 2.0], [3.0, 5.0]])
     left = jnp.array([[True, False], [True, True]])
-    found = jax.vmap(lambda v, w: team.still_earned(v, w, jnp.ones(2, bool), 0.5))(value, left)
+    found = team.still_paid(value, left, jnp.ones((2, 2), bool), 0.5)
     # (1 / 0.75) / 4 with one of two robots under way, (8 / 1) / 4 with both.
-    np.testing.assert_allclose(found, [1 / 3, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(found, [[1 / 3], [2.0]], rtol=1e-6)
