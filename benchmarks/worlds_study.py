@@ -4,8 +4,7 @@
 families of `stage=worlds10`, all seeds side by side in one program. It judges every seed at several
 points of its training, on the device. All arms are judged on the same new levels of each family,
 with the obstacle sizes of the suite `worlds`. It prints a JSON line for each arm as soon as the arm
-is done. It takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default. With
-`stage=world_trap_huge without=messages` it compares arms on very large dead ends.
+is done. It takes the keys of `Study` and of `swarmjax.train`; `seeds` is 10 by default.
 
 `python -m benchmarks.worlds_table FILE...` makes tables of the results.
 """
@@ -98,13 +97,11 @@ _PARTS = {
     "messages": ["task.neighbours.count=4", "task.neighbours.message_size=2"],
     "state": ["algo.critic=state"],
 }
-# Obstacle sizes of the suite `worlds`, and the largest huge trap, by stage. The stages have ranges
-# of sizes instead.
+# Obstacle sizes of the suite `worlds`; the stages for training have ranges of sizes instead.
 HARDEST: dict[str, dict[str, Any]] = {
-    "world_trap": {"width": 0.3, "depth": 0.3},
-    "world_fence": {"length": 0.6},
-    "world_door": {"gap": 0.13},
-    "world_trap_huge": {"width": 1.6, "depth": 0.8},
+    "trap": {"width": 0.3, "depth": 0.3},
+    "fence": {"length": 0.6},
+    "door": {"gap": 0.13},
 }
 
 
@@ -150,8 +147,10 @@ def load_arm(study: Study, arm: Arm, words: Sequence[str]) -> TrainConfig:
 
 
 def _hardest(stage: StageConfig) -> StageConfig:
-    """Returns a stage with the obstacle sizes that are judged."""
-    return replace(stage, **HARDEST.get(stage.name, {}))
+    """Returns a stage whose ranges of sizes are replaced by the sizes of the suite `worlds`."""
+    sizes = HARDEST.get(stage.level, {})
+    ranges = [name for name in sizes if isinstance(getattr(stage, name), tuple)]
+    return replace(stage, **{name: sizes[name] for name in ranges})
 
 
 def points(study: Study, trained: TrainConfig) -> np.ndarray:

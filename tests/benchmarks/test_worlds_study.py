@@ -51,12 +51,11 @@ def test_only_the_arm_without_curriculum_has_the_sizes_that_are_judged() -> None
     assert isinstance(worlds_study.load_arm(Study(), "random", []).stage[0].depth, tuple)
 
 
-def test_the_goal_among_huge_traps_is_the_largest() -> None:
-    words = ["stage=world_trap_huge"]
-    goal = worlds_study.load_arm(Study(without="messages"), "hardest", words).stage[0]
-    every = worlds_study.load_arm(Study(without="messages"), "random", words).stage[0]
-    assert (goal.width, goal.depth) == (1.6, 0.8)
-    assert (every.width, every.depth) == ((0.3, 1.6), (0.2, 0.8))
+def test_a_size_that_is_no_range_is_kept(tmp_path: Path) -> None:
+    stage = tmp_path / "deep.yaml"
+    stage.write_text("{level: trap, robots: 1, side: 1.6, width: [0.3, 0.8], depth: 0.7}")
+    hardest = worlds_study.load_arm(Study(without="messages"), "hardest", [f"stage={stage}"])
+    assert (hardest.stage[0].width, hardest.stage[0].depth) == (0.3, 0.7)
 
 
 def test_the_last_point_is_the_end() -> None:
