@@ -273,13 +273,7 @@ class TrainConfig(ProgramConfig):
                 "choose one, task.history=1 or algo.memory=none."
             )
         self._check_hearing()
-        latch, returns = self.task.arrival == "latch", self.algo.advantage == "monte_carlo"
-        if self.algo.team_reward and latch and returns:
-            raise ConfigError(
-                f"algo.team_reward is {show(self.algo.team_reward)}, but algo.advantage is "
-                "monte_carlo and task.arrival is latch, so returns end at a robot's arrival: give "
-                "algo.advantage=gae, task.arrival=hold or algo.team_reward=0."
-            )
+        self._check_team_reward()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
                 f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
@@ -303,6 +297,17 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
                 "works only with hidden layers: give algo.network=mlp or task.neighbours.count=0."
+            )
+
+    def _check_team_reward(self) -> None:
+        """Refuses shared rewards if a robot's return ends at its arrival."""
+        if not self.algo.team_reward:
+            return
+        if self.algo.advantage == "monte_carlo" and self.task.arrival == "latch":
+            raise ConfigError(
+                f"algo.team_reward is {show(self.algo.team_reward)}, but algo.advantage is "
+                "monte_carlo and task.arrival is latch, so returns end at a robot's arrival: give "
+                "algo.advantage=gae, task.arrival=hold or algo.team_reward=0."
             )
 
     def _check_budget(self) -> None:

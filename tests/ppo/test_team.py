@@ -43,8 +43,8 @@ def test_what_an_arrived_robot_still_gets_follows_from_the_values_of_the_others(
 
 
 def test_nothing_is_left_once_all_have_arrived() -> None:
-    value, nobody = jnp.array([1.0, jnp.nan]), jnp.zeros(2, bool)
-    assert team.still_paid(value, nobody, jnp.ones(2, bool), 1.0).tolist() == [0.0]
+    value, under_way = jnp.array([1.0, jnp.nan]), jnp.zeros(2, bool)
+    assert team.still_paid(value, under_way, jnp.ones(2, bool), 1.0).tolist() == [0.0]
 
 
 def test_arenas_are_valued_each_by_itself() -> None:

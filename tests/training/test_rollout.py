@@ -285,7 +285,7 @@ def test_a_robot_that_arrives_is_paid_its_share_of_what_the_others_still_earn(
         expected = (1 - part) * own + part * own.mean(axis=-1, keepdims=True)
         expected += np.where(arrives, last[:, None], 0.0)
         assert (arrives & under_way.any(axis=-1)[:, None]).any(), "one arrives before another"
-        # 32-bit numbers of order 1 in another order.
+        # 32-bit rounding of sums that are added in another order.
         np.testing.assert_allclose(shared.reward[pick][used], expected[used], atol=1e-6)
 
 
