@@ -28,7 +28,8 @@ from swarmjax.config import Section, about
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import checkpoint, directory, lifecycle, memory, trainer
 from swarmjax.run.display import Display, Row
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.run.trainer import Built, Compiled
 from swarmjax.sim import dispatch

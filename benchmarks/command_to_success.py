@@ -31,8 +31,8 @@ from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import POLICY
-from swarmjax.run.settings import load_train
 from swarmjax.task.stage_files import load_levels
 
 SHARES = (0.90, 0.95)

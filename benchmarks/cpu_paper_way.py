@@ -24,7 +24,7 @@ from benchmarks.mujoco_arena import Moved, MujocoArena
 from swarmjax import provenance
 from swarmjax.config import Section, about, to_dict
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.task import observation
 
 _WARM = 200  # control steps of the warm-up cycle

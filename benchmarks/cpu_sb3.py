@@ -26,7 +26,7 @@ from swarmjax import provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.ppo import optimizer
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 _LEVELS = 1_000_000  # level numbers reserved for each arena
 

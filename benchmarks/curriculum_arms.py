@@ -14,7 +14,8 @@ import numpy as np
 from benchmarks import key_value
 from swarmjax.config import ConfigError, Section, about
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
 
 BASELINE = "final"

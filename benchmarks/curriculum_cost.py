@@ -18,7 +18,8 @@ from typing import Any
 
 from benchmarks.pairs import Arm, median, time_in_turn
 from swarmjax import command, provenance
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 
 PAIRS = 20

@@ -29,7 +29,8 @@ from benchmarks.steps_per_second import made_with
 from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 from swarmjax.run import hosts
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 PAIRS = 10
 OTHER_SUMS = 5  # sums over devices per update, other than those of minibatches

@@ -35,7 +35,8 @@ from swarmjax.replay.config import ReplayConfig
 from swarmjax.report import rows, table
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
-from swarmjax.run.settings import TrainConfig, load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
 
 # Seconds of processor time until a refusal; a wall clock would also count the machine's other work.

@@ -19,7 +19,7 @@ import numpy as np
 
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run import trainer
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.training import loop, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState

@@ -35,7 +35,7 @@ from swarmjax.ppo.fast import fused
 from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.task import observation, surroundings
 from swarmjax.training import program as programs
 

@@ -22,7 +22,8 @@ import numpy as np
 
 from benchmarks import peers, steps_per_second, timing
 from swarmjax import command
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 from swarmjax.training import program as programs
 from swarmjax.training import seeds

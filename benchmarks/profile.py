@@ -28,7 +28,8 @@ import numpy as np
 
 from benchmarks import steps_per_second
 from swarmjax import command
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 TOP = 40
 UPDATES = 2  # number of updates in the traced call of training

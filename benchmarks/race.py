@@ -48,7 +48,8 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import optimizer
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 SHARES = (0.90, 0.95)
 # From MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`. Its minibatches

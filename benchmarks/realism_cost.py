@@ -19,7 +19,8 @@ from typing import Any
 from benchmarks.pairs import Arm, median, time_in_turn
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 from swarmjax.sim.realism_config import COUNTED, RealismConfig
 

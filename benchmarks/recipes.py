@@ -26,7 +26,8 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 from swarmjax.sim.config import RobotConfig
 from swarmjax.task import env, stage_files

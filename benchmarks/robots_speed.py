@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from benchmarks import key_value, steps_per_second
 from swarmjax import command
 from swarmjax.config import Section, about
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 _ROBOTS, _SIDE = 5, 1.2  # robots and side (m) of stage s6
 _LEAST = 0.8  # m; the three obstacles need an arena with at least this side

@@ -26,7 +26,8 @@ import numpy as np
 from benchmarks import key_value
 from swarmjax import command, environment, provenance
 from swarmjax.config import ConfigError, Section, about
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch, drive, physics
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.fast import discs as sim_discs

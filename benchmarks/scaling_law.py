@@ -37,7 +37,8 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import cells, statistics, trials
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.run.settings import TrainConfig, load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_files import load_levels
 
 MEASURES = ("targets_reached", "all_reached", "contacts_per_robot", "episode_time_s")

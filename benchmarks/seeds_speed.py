@@ -16,7 +16,8 @@ from typing import Any
 
 from benchmarks.pairs import Arm, median
 from swarmjax import command, provenance
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch
 
 PAIRS = 10

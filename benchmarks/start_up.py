@@ -19,7 +19,7 @@ from benchmarks.watched_run import MADE_WITH, Watched
 from swarmjax import command
 from swarmjax.config import Section, about
 from swarmjax.report.rows import Row
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 _FIRST = ("run.chunk=1", "run.stop_after=1")
 

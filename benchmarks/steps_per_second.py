@@ -31,7 +31,8 @@ from jax import Array
 from benchmarks import timing
 from swarmjax import command, provenance
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch, drive, physics
 from swarmjax.sim.config import physics_substeps
 from swarmjax.task import env

@@ -23,7 +23,8 @@ import jax
 from benchmarks import key_value, pairs
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 PAIRS = 15
 CALL_SECONDS = 0.7  # s; approximate time of a call of either side
@@ -31,7 +32,7 @@ CALL_SECONDS = 0.7  # s; approximate time of a call of either side
 _SIDE = """
 import sys
 from benchmarks.pairs import Arm
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 arm = Arm(load_train(sys.argv[1:]))
 print(arm.compile_s, flush=True)
 for line in sys.stdin:

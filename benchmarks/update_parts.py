@@ -26,7 +26,8 @@ from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo.learner import Batch, LearnerState
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState

@@ -27,8 +27,9 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import checkpoint
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task import env
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs

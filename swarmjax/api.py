@@ -98,7 +98,7 @@ def make_env(
       SwarmjaxError: an argument is invalid.
     """
     from swarmjax import environment
-    from swarmjax.run.settings import load_train
+    from swarmjax.run.load_settings import load_train
 
     given = {"robot": robot, "task": task, "realism": realism, "sim": sim, "extensions": extensions}
     named = {key: value for key, value in given.items() if value is not None}
@@ -146,7 +146,8 @@ def train_policy(
       SwarmjaxError: a setting is invalid, or the run broke.
     """
     from swarmjax.run import quiet
-    from swarmjax.run.settings import TrainConfig, load_run
+    from swarmjax.run.load_settings import load_run
+    from swarmjax.run.settings import TrainConfig
 
     if isinstance(settings, TrainConfig):
         config, auto = settings, False

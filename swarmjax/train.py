@@ -23,7 +23,7 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
     from swarmjax.run.display import working
 
     with working("starting"):
-        from swarmjax.run.settings import load_run
+        from swarmjax.run.load_settings import load_run
 
         settings, auto = load_run(arguments)
         if settings.run.coordinator is not None and not rank.is_child():

@@ -19,7 +19,8 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.exit_codes import FAILED
 from swarmjax.run import directory
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
+from swarmjax.run.load_settings import from_stored, read_config, settle
+from swarmjax.run.settings import TrainConfig
 
 
 @dataclass(frozen=True, kw_only=True)

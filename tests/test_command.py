@@ -16,7 +16,8 @@ from swarmjax.export.config import ExportConfig
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
-from swarmjax.run.settings import TrainConfig, load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
 from swarmjax.verify import VerifyConfig

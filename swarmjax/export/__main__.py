@@ -20,8 +20,9 @@ from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run.load_settings import from_stored, read_config, settle
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig, from_stored, read_config, settle
+from swarmjax.run.settings import TrainConfig
 
 # Default name of each format if `out` is not given.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}

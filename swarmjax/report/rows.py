@@ -19,7 +19,8 @@ import numpy as np
 from swarmjax.config import ConfigError, reading
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import recorder
-from swarmjax.run.settings import TrainConfig, from_stored
+from swarmjax.run.load_settings import from_stored
+from swarmjax.run.settings import TrainConfig
 
 Row = dict[str, Any]
 

@@ -21,7 +21,8 @@ from swarmjax.evaluate.statistics import LEAST_DRAWN, bootstrap
 from swarmjax.report import rows
 from swarmjax.report.rows import History
 from swarmjax.run.directory import CONFIG, METRICS
-from swarmjax.run.settings import TrainConfig, leaves
+from swarmjax.run.load_settings import leaves
+from swarmjax.run.settings import TrainConfig
 
 _DEEP = 2  # levels of subfolders that are searched for runs
 # Runs on one line may differ in these settings: which seeds they have, and how they ran.

@@ -14,7 +14,8 @@ from swarmjax.reproduce.config import ARMS, Arm, ReproduceConfig
 from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.display import Display
-from swarmjax.run.settings import TrainConfig, from_stored, load_train, read_config
+from swarmjax.run.load_settings import from_stored, load_train, read_config
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 
 _EXPANDED, _MODERN = "_expanded", "modern_"

@@ -23,7 +23,7 @@ from swarmjax.provenance import cores
 from swarmjax.report.rows import Row
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.rows import EVALUATION, EXPANDED, LAST
-from swarmjax.run.settings import from_stored
+from swarmjax.run.load_settings import from_stored
 from swarmjax.task import observation, stage_files
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig

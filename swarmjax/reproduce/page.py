@@ -14,7 +14,7 @@ from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.claims import ClaimVerdict
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, MODERN, PAIR, Reproduction
-from swarmjax.run.settings import leaves
+from swarmjax.run.load_settings import leaves
 
 PAGE, VERDICTS, FIGURES = "report.html", "verdicts.md", "figures"
 # Both readings of success, over all episodes and over those on the last stage.

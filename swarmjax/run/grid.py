@@ -9,7 +9,8 @@ from pathlib import Path
 
 from swarmjax.config import ConfigError, files, reading, show
 from swarmjax.run.directory import SUMMARY
-from swarmjax.run.settings import TrainConfig, load_run
+from swarmjax.run.load_settings import load_run
+from swarmjax.run.settings import TrainConfig
 
 GRID = "grid."
 MOST_CELLS = 256

@@ -21,7 +21,8 @@ from swarmjax import provenance
 from swarmjax.config import ConfigError, show, to_dict
 from swarmjax.run import rank
 from swarmjax.run.errors import LostPeerError
-from swarmjax.run.settings import TrainConfig, leaves
+from swarmjax.run.load_settings import leaves
+from swarmjax.run.settings import TrainConfig
 
 AUTO = "auto"
 CHECKPOINTS = "checkpoints"  # folder in a run directory

@@ -21,8 +21,9 @@ from swarmjax.run import checkpoint, directory, hosts, memory, warm_start, weigh
 from swarmjax.run.checkpoint import Checkpoints, Kept, Leaves
 from swarmjax.run.display import Display, working
 from swarmjax.run.errors import DivergedError, TrainingError
+from swarmjax.run.load_settings import from_stored, read_config
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
-from swarmjax.run.settings import TrainConfig, from_stored, read_config
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.run.trainer import Built, Tally, begin_tally, compile_chunk, prepare, train
 from swarmjax.run.warm_start import Source

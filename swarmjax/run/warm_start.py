@@ -18,7 +18,8 @@ from swarmjax import extension
 from swarmjax.config import ConfigError, show
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError, Leaves
-from swarmjax.run.settings import TrainConfig, from_stored, read_config
+from swarmjax.run.load_settings import from_stored, read_config
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 

@@ -21,7 +21,8 @@ from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.episodes import replay
 from swarmjax.report import rows
 from swarmjax.report.rows import History
-from swarmjax.run.settings import TrainConfig, settle
+from swarmjax.run.load_settings import settle
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.watch.config import WatchConfig
 

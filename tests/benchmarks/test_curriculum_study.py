@@ -21,7 +21,8 @@ from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task import level, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.training import program as programs

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import curriculum_cost, pairs
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 
 class Clock:

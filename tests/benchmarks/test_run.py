@@ -14,7 +14,7 @@ from sentences import refusal
 from benchmarks import key_value, peers, robots_speed, run, run_page, run_tables, steps_per_second
 from benchmarks.run import Line, Output, SuiteEntry, SuiteRunConfig
 from benchmarks.suites import SUITES
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 ENTRY = SuiteEntry(name="e", module="m", over="arenas", values=("8", "4", "2"), seconds=20.0)
 ALONE = SuiteEntry(name="a", module="m", seconds=20.0)

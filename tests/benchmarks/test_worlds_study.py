@@ -12,7 +12,7 @@ from sentences import refusal
 from benchmarks import key_value, worlds_study, worlds_table
 from benchmarks.worlds_study import Arm, Study
 from swarmjax import policy_file
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 

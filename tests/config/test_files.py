@@ -7,7 +7,8 @@ import pytest
 from sentences import refusal
 
 from swarmjax.config import files
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
 
 ROOT = Path(files.__file__).resolve().parents[2]

@@ -14,7 +14,8 @@ from sentences import refusal
 from swarmjax.config import ConfigError, Section, about, build, files, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
-from swarmjax.run.settings import RunConfig, TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import RunConfig, TrainConfig
 from swarmjax.sim.config import SimConfig
 from swarmjax.task.config import RewardConfig
 from swarmjax.task.stage_config import StageConfig, smallest_side

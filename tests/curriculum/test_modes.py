@@ -34,7 +34,8 @@ from swarmjax.curriculum.engine import (
 from swarmjax.curriculum.modes import MODES
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig

@@ -24,7 +24,8 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import PolicyError
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps, infrared, model, noise, physics
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.sim.realism_config import RealismConfig

@@ -18,8 +18,8 @@ from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.witness import load as witness_load
 from swarmjax.policy import Policy
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
-from swarmjax.run.settings import load_train
 from swarmjax.sim import physics
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig

@@ -10,8 +10,8 @@ from sentences import refusal
 from swarmjax.config import build, files, to_dict
 from swarmjax.evaluate import witness
 from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
-from swarmjax.run.settings import load_train
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 

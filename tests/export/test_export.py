@@ -18,8 +18,9 @@ from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
+from swarmjax.run.load_settings import load_train, read_config
 from swarmjax.run.policy_export import policy_meta
-from swarmjax.run.settings import TrainConfig, load_train, read_config
+from swarmjax.run.settings import TrainConfig
 
 FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
 

@@ -15,7 +15,8 @@ import jsonschema
 import pytest
 import yaml
 
-from swarmjax.run.settings import TrainConfig, load_run
+from swarmjax.run.load_settings import load_run
+from swarmjax.run.settings import TrainConfig
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "launch"
@@ -223,9 +224,9 @@ def test_what_an_image_copies_is_what_the_package_is_built_of(tmp_path: Path) ->
             shutil.copy(ROOT / source, copy_of)
     code = (
         "import sys\n"
-        "from swarmjax.run import settings\n"
-        "settings.load_run(sys.argv[1:])\n"
-        "print(settings.__file__)\n"
+        "from swarmjax.run import load_settings\n"
+        "load_settings.load_run(sys.argv[1:])\n"
+        "print(load_settings.__file__)\n"
     )
     told = subprocess.run(
         [sys.executable, "-c", code, *_command(_pod()["containers"][0], 0)],

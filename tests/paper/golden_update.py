@@ -18,7 +18,7 @@ from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import LearnerState
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Trajectory
 

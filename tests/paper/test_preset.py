@@ -11,7 +11,8 @@ from swarmjax import epuck
 from swarmjax.command import help_text
 from swarmjax.config import build, files, to_dict
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import drive
 from swarmjax.task import observation
 from swarmjax.task import stage as task_stage

@@ -14,7 +14,8 @@ import pytest
 
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.ppo import exploration
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import SimConfig
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout

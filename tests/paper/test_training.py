@@ -11,8 +11,9 @@ import pytest
 from swarmjax import policy
 from swarmjax.ppo import learner as ppo
 from swarmjax.run.checkpoint import to_leaves
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import write_policy
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.task.observation import SIZE
 from swarmjax.training import loop, seeds
 from swarmjax.training import program as programs

@@ -10,7 +10,8 @@ from sentences import refusal
 from swarmjax.config import build, to_dict
 from swarmjax.reproduce import arms as reproduce_arms
 from swarmjax.reproduce.config import ARMS, ReproduceConfig
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 
 OUT = Path("somewhere") / "a=b, c"

@@ -17,7 +17,7 @@ from swarmjax.config import ConfigError
 from swarmjax.run import directory, lifecycle
 from swarmjax.run.directory import Log
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 # A program that holds the lock of a directory until it is killed.
 _HOLDER = """

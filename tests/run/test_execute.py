@@ -3,7 +3,7 @@
 import pytest
 
 from swarmjax.run import execute
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.trainer import Tally
 
 SETTINGS = load_train(["stage=curriculum", "stage.sequence=[s1,s2]"])

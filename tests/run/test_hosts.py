@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from swarmjax.run import hosts, rank
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 
 ROOT = Path(__file__).parents[2]
 WORDS = ["arenas=64", "algo.num_minibatches=4", "run.tensorboard=false"]

@@ -14,7 +14,8 @@ from swarmjax.config import ConfigError
 from swarmjax.curriculum.config import CurriculumConfig, LevelsConfig
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import execute, lifecycle, memory, trainer
-from swarmjax.run.settings import RunConfig, TrainConfig, load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
+from swarmjax.run.settings import RunConfig, TrainConfig
 from swarmjax.task.observation import SIZE
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import seeds

@@ -6,7 +6,7 @@ import pytest
 from sentences import refusal
 
 from swarmjax.config import files, to_dict
-from swarmjax.run.settings import load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
 
 
 @pytest.fixture

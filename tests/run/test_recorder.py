@@ -11,8 +11,8 @@ import pytest
 from tensorboardX.record_writer import RecordWriter
 
 from swarmjax.run import recorder, trainer
+from swarmjax.run.load_settings import load_train
 from swarmjax.run.recorder import Recorder
-from swarmjax.run.settings import load_train
 from swarmjax.run.tensorboard import Boards
 
 ONE_SEED = {

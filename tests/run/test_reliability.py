@@ -25,7 +25,8 @@ from swarmjax.policy import digest
 from swarmjax.run import checkpoint, directory, lifecycle, trainer
 from swarmjax.run.directory import LOCK
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.settings import RunConfig, load_run
+from swarmjax.run.load_settings import load_run
+from swarmjax.run.settings import RunConfig
 
 TINY = [
     "stage=s1",

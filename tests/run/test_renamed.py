@@ -6,7 +6,8 @@ from sentences import refusal
 from swarmjax.config import build, to_dict
 from swarmjax.config.section import modernise
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
-from swarmjax.run.settings import TrainConfig, from_stored, load_train
+from swarmjax.run.load_settings import from_stored, load_train
+from swarmjax.run.settings import TrainConfig
 
 RENAMED = {
     "algo.rollout": ("algo.rollout_length", 16),

@@ -1,7 +1,6 @@
 """Checks every default, every check and every message of the settings."""
 
 import dataclasses
-import json
 import math
 import subprocess
 import sys
@@ -17,7 +16,8 @@ from swarmjax.command import help_text
 from swarmjax.config import build, files, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
-from swarmjax.run.settings import RunConfig, TrainConfig, from_stored, load_resume, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig
 from swarmjax.task.config import RewardConfig
 from swarmjax.task.stage_config import StageConfig, smallest_side
@@ -103,7 +103,9 @@ def test_configurations_are_frozen_and_hashable():
 
 def test_import_needs_neither_jax_nor_hydra():
     rooms = ("evaluate", "export", "replay", "report", "reproduce", "watch")
-    modules = ", ".join(["swarmjax.run.settings", *(f"swarmjax.{room}.config" for room in rooms)])
+    modules = ", ".join(
+        ["swarmjax.run.load_settings", *(f"swarmjax.{room}.config" for room in rooms)]
+    )
     code = f"import sys, {modules}; print({{'jax', 'hydra', 'omegaconf'}} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
@@ -467,20 +469,6 @@ def test_a_stage_name_can_be_part_of_a_path(name):
     assert sentence == f"stage.name is '{name}': give letters, digits, _ and - only."
 
 
-# Resume
-
-
-def test_resume_changes_budget_and_run_only():
-    stored = to_dict(load_train(["seed=7", "run.dir=old", "run.stop_after=3", "run.chunk=2"]))
-    before = json.dumps(stored)
-    resumed = load_resume(stored, ["budget=8e6", "resume=old", "run.tensorboard=false"])
-    assert (resumed.seed, resumed.budget, resumed.resume) == (7, 8_000_000, "old")
-    assert resumed.run == RunConfig(dir="old", chunk=2, tensorboard=False)
-    assert json.dumps(stored) == before
-    changed = {"budget": resumed.budget, "resume": "old", "run": resumed.run}
-    assert resumed == dataclasses.replace(build(TrainConfig, stored), **changed)
-
-
 @pytest.mark.parametrize("key", GONE)
 def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key):
     assert refusal(load_train, [f"algo.{key}=0.5"]) == (
@@ -494,55 +482,6 @@ def test_a_solver_is_refused_by_its_old_name():
     stored = to_dict(load_train([]))
     stored["sim"]["solver"] = "newton"
     assert refusal(build, TrainConfig, stored) == sentence
-
-
-def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
-    expected = load_train(["sim.solver=mjx", "algo.clip_epsilon=0.1"])
-    stored = to_dict(expected)
-    stored["sim"]["solver"] = "newton"
-    stored["algo"] |= dict.fromkeys(GONE, 0.5)
-    before = json.dumps(stored)
-    assert from_stored(stored) == expected
-    assert load_resume(stored, []) == expected
-    assert json.dumps(stored) == before
-    assert from_stored(to_dict(expected)) == expected
-    # A key that never existed is still refused, and so is a section without keys.
-    stored["algo"]["contact_prize"] = 0.5
-    assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
-    assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")
-
-
-def test_resume_may_stop_again():
-    stored = to_dict(load_train(["run.stop_after=3"]))
-    assert load_resume(stored, []).run.stop_after is None
-    assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
-
-
-def test_a_run_from_before_the_choice_of_gradient_goes_on():
-    stored = to_dict(load_train([]))
-    assert stored["algo"].pop("update_backend") == "auto"
-    assert load_resume(stored, []).algo.update_backend == "auto"
-
-
-def test_a_long_word_is_shortened_where_resume_refuses_it():
-    assert len(refusal(load_resume, to_dict(load_train([])), ["seed=" + "9" * 4000])) < 300
-
-
-@pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip_epsilon=0.1", "run=3"])
-def test_resume_refuses_other_keys(word):
-    stored = to_dict(load_train([]))
-    assert refusal(load_resume, stored, [word]) == (
-        f"{word} cannot be given: resume keeps the rest of the stored run and takes budget, "
-        "devices, resume, run.*, streams only."
-    )
-
-
-def test_resume_checks_keys_and_values():
-    stored = to_dict(load_train([]))
-    assert refusal(load_resume, stored, ["budgt=3"]) == ("budgt is not a key: did you mean budget?")
-    assert refusal(load_resume, stored, ["run.dry=3"]) == "run.dry is 3: give true or false."
-    assert refusal(load_resume, stored, ["budget=[1"]).startswith("'budget=[1' cannot be read: ")
-    assert refusal(load_resume, stored | {"arenas": 3}, []).startswith("stored arenas is 3, but ")
 
 
 # Help

@@ -21,7 +21,8 @@ from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.directory import LOCK
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.training import program as programs
 
 TINY = [

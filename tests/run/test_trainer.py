@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from swarmjax.run import trainer
-from swarmjax.run.settings import RunConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import RunConfig
 from swarmjax.run.signals import Stop
 
 

@@ -15,7 +15,8 @@ from swarmjax import command, train
 from swarmjax.config import to_dict
 from swarmjax.run import checkpoint, warm_start
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
-from swarmjax.run.settings import TrainConfig, load_train, read_config
+from swarmjax.run.load_settings import load_train, read_config
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.warm_start import Source
 from swarmjax.training import program as programs
 from swarmjax.training import seeds

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from entries import BEARING, DISTANCE, INFRARED, KNOWN, TARGET
 
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, noise
 from swarmjax.sim.config import RobotConfig

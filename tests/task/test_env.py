@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from entries import BEARING, DISTANCE, INFRARED, KNOWN
 
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
 from swarmjax.task import factors as task_factors

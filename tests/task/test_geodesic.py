@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from swarmjax.evaluate.shortest_path import shortest
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.sim import physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env, extended, geodesic, level

@@ -10,7 +10,7 @@ import pytest
 
 from swarmjax.config import ConfigError, build
 from swarmjax.curriculum import levels
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.sim import gaps
 from swarmjax.task import level, mutation
 from swarmjax.task import stage as task_stage

@@ -11,7 +11,8 @@ from sentences import refusal
 from swarmjax.command import help_text
 from swarmjax.config import build, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig, physics_substeps
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, resolve_encoding

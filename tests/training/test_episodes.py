@@ -13,7 +13,8 @@ from sentences import refusal
 
 from swarmjax.run import checkpoint, trainer
 from swarmjax.run.display import Display
-from swarmjax.run.settings import TrainConfig, load_train
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.training import episodes, seeds

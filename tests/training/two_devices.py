@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from swarmjax.run import trainer
-from swarmjax.run.settings import load_train
+from swarmjax.run.load_settings import load_train
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 

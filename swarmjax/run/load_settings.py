@@ -1,0 +1,284 @@
+"""Makes the settings of a run from its words, and from the directory of a run that goes on."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from swarmjax import extension
+from swarmjax.config import ConfigError, build, files, inherit, reading, section, show, to_dict
+from swarmjax.config.section import modernise
+from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.run import recipes
+from swarmjax.run.directory import CONFIG, MAY_CHANGE
+from swarmjax.run.settings import TrainConfig
+from swarmjax.task import pieces, stage_files
+
+AUTO = "auto"  # `arenas` accepts this word in place of a number
+
+# The keys that a resumed run accepts. All other keys determine what the run has computed so far.
+_RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
+
+
+def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
+    """Makes the configuration that a run directory or a policy holds, written by any version.
+
+    Args:
+      stored: the result of `to_dict`. Old names of keys are translated, and removed keys are left
+        out.
+      where: the prefix of its keys in messages.
+
+    Raises:
+      ConfigError: if it is invalid.
+    """
+    return build(TrainConfig, modernise(TrainConfig, stored), where)
+
+
+def read_config(run: Path) -> dict:
+    """Reads the config that a run directory was trained with.
+
+    Args:
+      run: the directory.
+
+    Returns:
+      The config as plain data, unchecked.
+
+    Raises:
+      ConfigError: if there is none, or it is not a JSON object.
+    """
+    path = run / CONFIG
+    section.check_text("the run directory", str(run))
+    if not path.exists():
+        raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
+    found = reading.read_json(path)
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path} is not a run's config: it holds no JSON object.")
+    return found
+
+
+def load_train(
+    overrides: Sequence[str],
+    *,
+    auto: bool = False,
+    stages: Sequence[dict[str, Any]] | None = None,
+) -> TrainConfig:
+    """Makes the configuration of `swarmjax.train` from its `key=value` words.
+
+    Args:
+      overrides: the words.
+      auto: whether to accept `arenas=auto`. The config then has the smallest possible number of
+        arenas, `algo.num_minibatches`. `memory.fill` chooses the final number later.
+      stages: plain data of the stages, in place of a file.
+
+    Raises:
+      ConfigError: if a word, a choice, a file or a value is invalid.
+    """
+
+    def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
+        if auto and mapping.get("arenas") == AUTO:
+            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
+        if "init_from_std" in mapping and mapping.get("init_from") is None:
+            raise ConfigError(
+                f"init_from_std is {mapping['init_from_std']}, but there is no init_from: give "
+                "init_from=DIR with it, the directory of a run."
+            )
+        if stages is not None:
+            return mapping | {"stage": list(stages)}
+        found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
+        return mapping | {"stage": found, "stage_name": stage_files.name_of(chosen["stage"])}
+
+    given = recipes.expand(TrainConfig, overrides)
+    return settle(files.load(TrainConfig, [*_inherited(given), *given], complete))
+
+
+# The algo keys that a run with init_from must share with the run that it starts from.
+_SHARED = (
+    "policy",
+    "network",
+    "hidden_sizes",
+    "memory",
+    "memory_size",
+    "critic",
+    "activation",
+    "mean_activation",
+)
+
+
+def _inherited(typed: Sequence[str]) -> list[str]:
+    """Returns the words that a run with `init_from` takes from the run that it starts from.
+
+    They set robot, task, realism and the shape of the networks. Typed words override them.
+    """
+    source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
+    if not isinstance(source, str):
+        return []
+    try:
+        held = from_stored(read_config(Path(source)))
+    except ConfigError:  # `warm_start.read` reports it later, when the run begins
+        return []
+    others = [key for key in to_dict(held.algo) if key not in _SHARED]
+    if held.algo.memory == "none" or any(
+        word.startswith(("algo.memory=", "algo=")) for word in typed
+    ):
+        others.append("memory_size")  # this key belongs to the kind of memory that was typed
+    return [
+        *inherit.group_words(TrainConfig, "robot", held.robot, typed),
+        *inherit.group_words(TrainConfig, "task", held.task, typed),
+        *inherit.group_words(TrainConfig, "algo", held.algo, typed, skip=others),
+        *inherit.preset_words(TrainConfig, "realism", held.realism, typed),
+    ]
+
+
+def settle(settings: TrainConfig) -> TrainConfig:
+    """Adds the full names and digests of the extension pieces that a run uses.
+
+    Args:
+      settings: the config. Digests that the config already holds come from a stored run.
+
+    Raises:
+      ConfigError: if a piece is missing, or differs from the one that the stored run used.
+    """
+    found = extension.load(settings.extensions)
+    extension.check_needs(settings.pieces, found, "the stored run")
+    used = pieces.choose(found, settings.task, settings.stage)
+    network = resolve(settings.algo, found.networks)
+    if settings.extensions is None:
+        return settings
+    drawn = {stage.level for stage in settings.stage}
+    chosen = found._replace(
+        rewards=tuple(piece for piece, _ in used.terms),
+        observations=used.observations,
+        levels=tuple(each for each in found.levels if each.name in drawn),
+        networks=tuple(each for each in found.networks if each.name == network),
+    )
+    return replace(
+        settings,
+        task=pieces.resolve(found, settings.task),
+        algo=replace(settings.algo, network=network),
+        pieces=chosen.digests(),
+    )
+
+
+def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
+    """Makes the configuration with which a stored run goes on.
+
+    `run.stop_after` is not kept: it interrupted the stored run, and would stop this one at once.
+
+    Args:
+      stored: configuration of the run, as `to_dict` gave it.
+      overrides: `key=value` words, only for keys that may change.
+
+    Raises:
+      ConfigError: if another key is given, or a stored or new value is invalid.
+    """
+    words = files.split_words(TrainConfig, overrides)
+    for key, word in words.items():
+        if key not in _RESUME_KEYS and not key.startswith("run."):
+            allowed = ", ".join(_RESUME_KEYS)
+            raise ConfigError(
+                f"{section.show(word, quote='')} cannot be given: resume keeps the rest of "
+                f"the stored run and takes {allowed} only."
+            )
+    given = files.values(words)
+    kept = to_dict(from_stored(stored, "stored "))
+    run = kept["run"] | {"stop_after": None} | given.get("run", {})
+    spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
+    return settle(build(TrainConfig, kept | spread | given | {"run": run}))
+
+
+def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
+    """Spreads a resumed run over its devices, and keeps its random streams if they fit."""
+    by_seeds = seeds_by == "devices"
+    fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
+    return {"devices": devices, "streams": streams if fits else None}
+
+
+def load_run(
+    overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
+) -> tuple[TrainConfig, bool]:
+    """Makes the configuration of a new run or, with `resume=`, of a run that goes on.
+
+    Args:
+      overrides: `key=value` words; with `resume`, only for keys that may change.
+      stages: plain data of the stages of a new run, in place of a file.
+
+    Returns:
+      The configuration, and whether the number of arenas is still to be chosen.
+
+    Raises:
+      ConfigError: if a word, a choice, a file or a value is invalid.
+    """
+    resumed = _by_key(overrides).get("resume", "null").strip("'\"")
+    if resumed not in ("", "null", AUTO):
+        return _go_on(Path(resumed), overrides), False
+    overrides = recipes.expand(TrainConfig, overrides)
+    given = _by_key(overrides)
+    if resumed == AUTO:
+        return _go_on_or_begin(overrides, given, stages)
+    auto = given.get("arenas", "").strip("'\"") == AUTO
+    return load_train(overrides, auto=auto, stages=stages), auto
+
+
+def _go_on(run: Path, overrides: Sequence[str]) -> TrainConfig:
+    """Makes the configuration with which the run in a directory goes on."""
+    settings = load_resume(read_config(run), overrides)
+    asked = _by_key(overrides).get("run.dir", "null") not in ("", "null")
+    directory = settings.run.dir if asked else None
+    return replace(settings, run=replace(settings.run, dir=directory or settings.resume))
+
+
+def _by_key(words: Sequence[str]) -> dict[str, str]:
+    """Returns the value of each key as typed; the last one counts."""
+    return {key: value for key, _, value in (word.partition("=") for word in words)}
+
+
+def _go_on_or_begin(
+    overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
+) -> tuple[TrainConfig, bool]:
+    """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
+    if given.get("run.dir", "null") in ("", "null"):
+        raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
+    begun = [word for word in overrides if word.partition("=")[0] != "resume"]
+    auto = given.get("arenas", "").strip("'\"") == AUTO
+    typed = load_train(begun, auto=auto, stages=stages)
+    run = Path(typed.run.dir or "")
+    if not (run / CONFIG).exists():
+        return typed, auto
+    stored = from_stored(read_config(run), "stored ")
+    if auto:
+        typed = replace(typed, arenas=stored.arenas)
+    _check_unchanged(run, to_dict(typed), to_dict(stored))
+    kept = replace(typed.run, id=stored.run.id)
+    spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
+    if typed.streams is not None and "streams" in given:
+        spread["streams"] = typed.streams
+    settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
+    return settle(settled), False
+
+
+def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
+    """Refuses to resume a run with other settings than its own, and names the keys that differ."""
+    mine, its = (
+        leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
+    )
+    changed = [key for key in mine if mine[key] != its.get(key)]
+    if changed:
+        shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
+        raise ConfigError(
+            f"resume is auto, but {run} holds a run with other settings: {shown}. A resumed run "
+            f"may change only {', '.join(_RESUME_KEYS)}: give its own settings, or another run.dir."
+        )
+
+
+def leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Flattens nested settings to dotted keys.
+
+    Args:
+      found: plain data, as `to_dict` gives it.
+      where: the prefix of its keys.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in found.items():
+        inner = isinstance(value, Mapping)
+        flat |= leaves(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
+    return flat

@@ -1,0 +1,73 @@
+"""Tests how the settings of stored runs are read, and what a resumed run may change."""
+
+import dataclasses
+import json
+
+import pytest
+from sentences import refusal
+
+from swarmjax.config import build, to_dict
+from swarmjax.run.load_settings import from_stored, load_resume, load_train
+from swarmjax.run.settings import RunConfig, TrainConfig
+
+GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
+
+
+def test_resume_changes_budget_and_run_only():
+    stored = to_dict(load_train(["seed=7", "run.dir=old", "run.stop_after=3", "run.chunk=2"]))
+    before = json.dumps(stored)
+    resumed = load_resume(stored, ["budget=8e6", "resume=old", "run.tensorboard=false"])
+    assert (resumed.seed, resumed.budget, resumed.resume) == (7, 8_000_000, "old")
+    assert resumed.run == RunConfig(dir="old", chunk=2, tensorboard=False)
+    assert json.dumps(stored) == before
+    changed = {"budget": resumed.budget, "resume": "old", "run": resumed.run}
+    assert resumed == dataclasses.replace(build(TrainConfig, stored), **changed)
+
+
+def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
+    expected = load_train(["sim.solver=mjx", "algo.clip_epsilon=0.1"])
+    stored = to_dict(expected)
+    stored["sim"]["solver"] = "newton"
+    stored["algo"] |= dict.fromkeys(GONE, 0.5)
+    before = json.dumps(stored)
+    assert from_stored(stored) == expected
+    assert load_resume(stored, []) == expected
+    assert json.dumps(stored) == before
+    assert from_stored(to_dict(expected)) == expected
+    # A key that never existed is still refused, and so is a section without keys.
+    stored["algo"]["contact_prize"] = 0.5
+    assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
+    assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")
+
+
+def test_resume_may_stop_again():
+    stored = to_dict(load_train(["run.stop_after=3"]))
+    assert load_resume(stored, []).run.stop_after is None
+    assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
+
+
+def test_a_run_from_before_the_choice_of_gradient_goes_on():
+    stored = to_dict(load_train([]))
+    assert stored["algo"].pop("update_backend") == "auto"
+    assert load_resume(stored, []).algo.update_backend == "auto"
+
+
+def test_a_long_word_is_shortened_where_resume_refuses_it():
+    assert len(refusal(load_resume, to_dict(load_train([])), ["seed=" + "9" * 4000])) < 300
+
+
+@pytest.mark.parametrize("word", ["arenas=256", "stage=s3", "algo.clip_epsilon=0.1", "run=3"])
+def test_resume_refuses_other_keys(word):
+    stored = to_dict(load_train([]))
+    assert refusal(load_resume, stored, [word]) == (
+        f"{word} cannot be given: resume keeps the rest of the stored run and takes budget, "
+        "devices, resume, run.*, streams only."
+    )
+
+
+def test_resume_checks_keys_and_values():
+    stored = to_dict(load_train([]))
+    assert refusal(load_resume, stored, ["budgt=3"]) == ("budgt is not a key: did you mean budget?")
+    assert refusal(load_resume, stored, ["run.dry=3"]) == "run.dry is 3: give true or false."
+    assert refusal(load_resume, stored, ["budget=[1"]).startswith("'budget=[1' cannot be read: ")
+    assert refusal(load_resume, stored | {"arenas": 3}, []).startswith("stored arenas is 3, but ")
