@@ -14,10 +14,22 @@ from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import pieces, stage_files
 
-AUTO = "auto"  # `arenas` accepts this word in place of a number
+AUTO = "auto"  # `arenas` and `resume` accept this word in place of a number or a directory
 
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
+
+# The algo keys that a run with init_from must share with the run that it starts from.
+_SHARED = (
+    "policy",
+    "network",
+    "hidden_sizes",
+    "memory",
+    "memory_size",
+    "critic",
+    "activation",
+    "mean_activation",
+)
 
 
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
@@ -89,19 +101,6 @@ def load_train(
 
     given = recipes.expand(TrainConfig, overrides)
     return settle(files.load(TrainConfig, [*_inherited(given), *given], complete))
-
-
-# The algo keys that a run with init_from must share with the run that it starts from.
-_SHARED = (
-    "policy",
-    "network",
-    "hidden_sizes",
-    "memory",
-    "memory_size",
-    "critic",
-    "activation",
-    "mean_activation",
-)
 
 
 def _inherited(typed: Sequence[str]) -> list[str]:
