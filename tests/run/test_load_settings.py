@@ -7,10 +7,8 @@ import pytest
 from sentences import refusal
 
 from swarmjax.config import build, to_dict
-from swarmjax.run.load_settings import from_stored, load_resume, load_train
+from swarmjax.run.load_settings import load_resume, load_train
 from swarmjax.run.settings import RunConfig, TrainConfig
-
-GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
 
 
 def test_resume_changes_budget_and_run_only():
@@ -22,22 +20,6 @@ def test_resume_changes_budget_and_run_only():
     assert json.dumps(stored) == before
     changed = {"budget": resumed.budget, "resume": "old", "run": resumed.run}
     assert resumed == dataclasses.replace(build(TrainConfig, stored), **changed)
-
-
-def test_what_older_versions_stored_is_read_with_its_old_names_and_keys():
-    expected = load_train(["sim.solver=mjx", "algo.clip_epsilon=0.1"])
-    stored = to_dict(expected)
-    stored["sim"]["solver"] = "newton"
-    stored["algo"] |= dict.fromkeys(GONE, 0.5)
-    before = json.dumps(stored)
-    assert from_stored(stored) == expected
-    assert load_resume(stored, []) == expected
-    assert json.dumps(stored) == before
-    assert from_stored(to_dict(expected)) == expected
-    # A key that never existed is still refused, and so is a section without keys.
-    stored["algo"]["contact_prize"] = 0.5
-    assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
-    assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")
 
 
 def test_resume_may_stop_again():

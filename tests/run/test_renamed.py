@@ -1,4 +1,6 @@
-"""Checks renamed keys: a typed old name is refused with its new name, and a stored one is read."""
+"""Checks renamed and removed keys: typed ones are refused with advice, stored ones are read."""
+
+import json
 
 import pytest
 from sentences import refusal
@@ -6,7 +8,7 @@ from sentences import refusal
 from swarmjax.config import build, to_dict
 from swarmjax.config.section import modernise
 from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
-from swarmjax.run.load_settings import from_stored, load_train
+from swarmjax.run.load_settings import from_stored, load_resume, load_train
 from swarmjax.run.settings import TrainConfig
 
 RENAMED = {
@@ -21,6 +23,7 @@ RENAMED = {
     "start": ("init_from", "runs/a"),
     "start_std": ("init_from_std", "reset"),
 }
+GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
 
 
 @pytest.mark.parametrize(("old", "new"), [(old, new) for old, (new, _) in RENAMED.items()])
@@ -66,3 +69,34 @@ def test_what_is_no_section_is_left_for_the_reader_to_refuse() -> None:
 def test_a_stored_reproduction_is_read_by_its_old_name() -> None:
     stored = modernise(ReproduceConfig, {"rollout": 64, "epochs": 2})
     assert build(ReproduceConfig, stored).rollout_length == 64
+
+
+@pytest.mark.parametrize("key", GONE)
+def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key: str) -> None:
+    assert refusal(load_train, [f"algo.{key}=0.5"]) == (
+        f"algo.{key} is no longer a key: give a negative task.reward.robot_contact instead."
+    )
+
+
+def test_a_solver_is_refused_by_its_old_name() -> None:
+    sentence = "sim.solver is newton, which is called mjx now: give mjx."
+    assert refusal(load_train, ["sim.solver=newton"]) == sentence
+    stored = to_dict(load_train([]))
+    stored["sim"]["solver"] = "newton"
+    assert refusal(build, TrainConfig, stored) == sentence
+
+
+def test_what_older_versions_stored_is_read_with_its_old_names_and_keys() -> None:
+    expected = load_train(["sim.solver=mjx", "algo.clip_epsilon=0.1"])
+    stored = to_dict(expected)
+    stored["sim"]["solver"] = "newton"
+    stored["algo"] |= dict.fromkeys(GONE, 0.5)
+    before = json.dumps(stored)
+    assert from_stored(stored) == expected
+    assert load_resume(stored, []) == expected
+    assert json.dumps(stored) == before
+    assert from_stored(to_dict(expected)) == expected
+    # A key that never existed is still refused, and so is a section without keys.
+    stored["algo"]["contact_prize"] = 0.5
+    assert refusal(from_stored, stored, "stored ").startswith("stored algo.contact_prize is not a ")
+    assert refusal(from_stored, stored | {"algo": 3}, "stored ").startswith("stored algo is 3: ")

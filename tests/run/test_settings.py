@@ -25,7 +25,6 @@ from swarmjax.task.stage_files import load_levels
 
 ROOT = Path(files.__file__).resolve().parents[2]
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
-GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
 CHOICES = ", ".join(sorted(path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")))
 
 
@@ -467,21 +466,6 @@ def test_every_stage_fits_the_largest_arena(robots, obstacles, size):
 def test_a_stage_name_can_be_part_of_a_path(name):
     sentence = refusal(build, TrainConfig, {"stage": [STAGE | {"name": name}]})
     assert sentence == f"stage.name is '{name}': give letters, digits, _ and - only."
-
-
-@pytest.mark.parametrize("key", GONE)
-def test_keys_of_a_price_that_adapts_are_refused_with_what_to_give_instead(key):
-    assert refusal(load_train, [f"algo.{key}=0.5"]) == (
-        f"algo.{key} is no longer a key: give a negative task.reward.robot_contact instead."
-    )
-
-
-def test_a_solver_is_refused_by_its_old_name():
-    sentence = "sim.solver is newton, which is called mjx now: give mjx."
-    assert refusal(load_train, ["sim.solver=newton"]) == sentence
-    stored = to_dict(load_train([]))
-    stored["sim"]["solver"] = "newton"
-    assert refusal(build, TrainConfig, stored) == sentence
 
 
 # Help
