@@ -1,0 +1,18 @@
+"""Policy files (docs/policy-format.md). Start at `read`.
+
+`archive` reads and writes the files, and `fields` checks what they hold. May import `config`,
+`policy.py`, `policy_network.py`, `extension.py` and `atomic_file.py`. No JAX.
+"""
+
+from swarmjax.policy_file.archive import read, read_meta, write
+from swarmjax.policy_file.fields import ACTION_NAMES, ACTION_UNITS, action_layout, check
+
+__all__ = [
+    "ACTION_NAMES",
+    "ACTION_UNITS",
+    "action_layout",
+    "check",
+    "read",
+    "read_meta",
+    "write",
+]
