@@ -21,7 +21,7 @@ from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
 from swarmjax.config.reading import parse_json
 from swarmjax.policy import FORMAT, MAX_BYTES, MAX_ENTRIES, MAX_LETTERS, Policy, PolicyError
-from swarmjax.policy_file.fields import NETWORK, check, file_format, hidden_layers, show
+from swarmjax.policy_file.fields import NETWORK, check, file_format, hidden_layers, short_json
 from swarmjax.policy_network import PolicyNetwork
 
 _MEMBER = re.compile(
@@ -170,8 +170,8 @@ def _check_file(content: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     found = policy.digest(members)
     if found != expected:
         raise PolicyError(
-            f"digest is {show(expected[:12])}..., but the content has digest "
-            f"{show(found[:12])}...: the file was changed or damaged."
+            f"digest is {short_json(expected[:12])}..., but the content has digest "
+            f"{short_json(found[:12])}...: the file was changed or damaged."
         )
     del members["meta"]
     check(members, meta)
@@ -210,11 +210,13 @@ def _check_member(member: zipfile.ZipInfo, found: Set[str]) -> None:
     """Refuses a member that no policy has, before reading it."""
     name = member.filename
     if not _MEMBER.fullmatch(name):
-        raise PolicyError(f"{show(name)} is not known: format {FORMAT} has no such member.")
+        raise PolicyError(f"{short_json(name)} is not known: format {FORMAT} has no such member.")
     if name in found:
-        raise PolicyError(f"{show(name)} appears more than once: expected each member once.")
+        raise PolicyError(f"{short_json(name)} appears more than once: expected each member once.")
     if member.flag_bits & 1 or member.compress_type != zipfile.ZIP_STORED:
-        raise PolicyError(f"{show(name)} is compressed or encrypted: expected stored members.")
+        raise PolicyError(
+            f"{short_json(name)} is compressed or encrypted: expected stored members."
+        )
 
 
 def _parse_array(name: str, data: bytes) -> np.ndarray:
@@ -263,7 +265,7 @@ def _parse_meta(text: str) -> dict[str, Any]:
     except ConfigError as error:
         raise PolicyError(str(error)) from None
     if not isinstance(meta, dict):
-        raise PolicyError(f"meta is {show(meta)}: expected a JSON object.")
+        raise PolicyError(f"meta is {short_json(meta)}: expected a JSON object.")
     return meta
 
 

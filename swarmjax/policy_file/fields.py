@@ -58,23 +58,23 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     own = "network" in meta
     if meta.get("format") != file_format(meta):
         raise PolicyError(
-            f"meta.format is {show(meta.get('format'))}, but this version reads {FORMAT}, "
+            f"meta.format is {short_json(meta.get('format'))}, but this version reads {FORMAT}, "
             f"{NETWORK_FORMAT} with meta.network, {MEMORY_FORMAT} with meta.memory or a history, "
             f"and {HEARING_FORMAT} with neighbours: export the policy from its run again."
         )
     if own and not _is_name(meta["network"]):
-        raise PolicyError(f"meta.network is {show(meta['network'])}: expected a name.")
+        raise PolicyError(f"meta.network is {short_json(meta['network'])}: expected a name.")
     for key, kind in _META.items():
         _entry(meta, key, kind)
     _choice(meta, "policy", ("shared", "independent"))
     _choice(meta, "activation", ACTIVATIONS)
     for key in ("update", "seed"):
         if meta[key] < 0:
-            raise PolicyError(f"meta.{key} is {show(meta[key])}: expected 0 or more.")
+            raise PolicyError(f"meta.{key} is {short_json(meta[key])}: expected 0 or more.")
     learners = meta["learners"]
     if learners < 1 or (meta["policy"] == "shared" and learners != 1):
         expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
-        raise PolicyError(f"meta.learners is {show(learners)}: expected {expected}.")
+        raise PolicyError(f"meta.learners is {short_json(learners)}: expected {expected}.")
     _check_optional(meta)
     recalled, heard = _check_memory(meta), _check_neighbours(meta)
     size = _check_observation(meta["observation"]) * _check_history(meta)
@@ -120,7 +120,7 @@ def _check_history(meta: Mapping[str, Any]) -> int:
     history = meta["observation"]["history"]
     if not 1 <= history <= _MOST_HISTORY:
         raise PolicyError(
-            f"meta.observation.history is {show(history)}: expected 1 to {_MOST_HISTORY}."
+            f"meta.observation.history is {short_json(history)}: expected 1 to {_MOST_HISTORY}."
         )
     if history > 1 and "memory" in meta:
         raise PolicyError(
@@ -140,7 +140,8 @@ def _check_memory(meta: Mapping[str, Any]) -> int:
     _entry(meta["memory"], "size", int, "meta.memory")
     if not 1 <= meta["memory"]["size"] <= _MOST_MEMORY:
         raise PolicyError(
-            f"meta.memory.size is {show(meta['memory']['size'])}: expected 1 to {_MOST_MEMORY}."
+            f"meta.memory.size is {short_json(meta['memory']['size'])}: "
+            f"expected 1 to {_MOST_MEMORY}."
         )
     return meta["memory"]["size"]
 
@@ -187,7 +188,7 @@ def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
         _entry(held, key, int, where)
         if not least <= held[key] <= _MOST_HEARD:
             raise PolicyError(
-                f"{where}.{key} is {show(held[key])}: expected {least} to {_MOST_HEARD}."
+                f"{where}.{key} is {short_json(held[key])}: expected {least} to {_MOST_HEARD}."
             )
     _check_positive(held, "range", where)
     if meta["observation"].get("history", 1) != 1:
@@ -203,7 +204,7 @@ def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta"
         raise PolicyError(f"{where}.{key} is missing: expected {_KINDS[kind]}.")
     value = mapping[key]
     if not isinstance(value, kind) or isinstance(value, bool):
-        raise PolicyError(f"{where}.{key} is {show(value)}: expected {_KINDS[kind]}.")
+        raise PolicyError(f"{where}.{key} is {short_json(value)}: expected {_KINDS[kind]}.")
 
 
 def _check_optional(meta: Mapping[str, Any]) -> None:
@@ -213,10 +214,12 @@ def _check_optional(meta: Mapping[str, Any]) -> None:
             _entry(meta, key, dict)
     for name, pieces in meta.get("extensions", {}).items():
         if not _are_texts(pieces):
-            raise PolicyError(f"meta.extensions.{show(name)} is {show(pieces)}: expected digests.")
+            raise PolicyError(
+                f"meta.extensions.{short_json(name)} is {short_json(pieces)}: expected digests."
+            )
     stages = meta.get("stages", [])
     if not isinstance(stages, list | tuple) or not all(isinstance(x, dict) for x in stages):
-        raise PolicyError(f"meta.stages is {show(stages)}: expected a list of objects.")
+        raise PolicyError(f"meta.stages is {short_json(stages)}: expected a list of objects.")
 
 
 def _are_texts(pieces: object) -> bool:
@@ -229,7 +232,7 @@ def _choice(
 ) -> None:
     if mapping.get(key) not in choices:
         allowed = " or ".join(choices)
-        raise PolicyError(f"{where}.{key} is {show(mapping.get(key))}: expected {allowed}.")
+        raise PolicyError(f"{where}.{key} is {short_json(mapping.get(key))}: expected {allowed}.")
 
 
 def _check_observation(layout: Mapping[str, Any]) -> int:
@@ -237,7 +240,7 @@ def _check_observation(layout: Mapping[str, Any]) -> int:
     where = "meta.observation"
     names, units = _words(layout, "names", _NAME), _words(layout, "units", _UNIT)
     if not names or len(set(names)) < len(names):
-        raise PolicyError(f"{where}.names is {show(names)}: expected names that differ.")
+        raise PolicyError(f"{where}.names is {short_json(names)}: expected names that differ.")
     if len(units) != len(names):
         raise PolicyError(
             f"{where}.units has {len(units)} entries: expected {len(names)}, as many as names."
@@ -250,7 +253,7 @@ def _check_observation(layout: Mapping[str, Any]) -> int:
     _check_positive(layout, "limit", where)
     if layout["limit"] > _MOST_LIMIT:
         raise PolicyError(
-            f"{where}.limit is {show(layout['limit'])}: expected at most {_MOST_LIMIT:g}."
+            f"{where}.limit is {short_json(layout['limit'])}: expected at most {_MOST_LIMIT:g}."
         )
     return len(names)
 
@@ -262,7 +265,8 @@ def _words(layout: Mapping[str, Any], key: str, form: re.Pattern[str]) -> list[s
         isinstance(item, str) and form.fullmatch(item) for item in value
     ):
         raise PolicyError(
-            f"meta.observation.{key} is {show(value)}: expected a list of {key} in plain letters."
+            f"meta.observation.{key} is {short_json(value)}: "
+            f"expected a list of {key} in plain letters."
         )
     return list(value)
 
@@ -270,13 +274,13 @@ def _words(layout: Mapping[str, Any], key: str, form: re.Pattern[str]) -> list[s
 def _check_numbers(layout: Mapping[str, Any], key: str, size: int, where: str) -> None:
     value = layout.get(key)
     if not isinstance(value, list | tuple) or len(value) != size or not all(map(_is_number, value)):
-        raise PolicyError(f"{where}.{key} is {show(value)}: expected {size} finite numbers.")
+        raise PolicyError(f"{where}.{key} is {short_json(value)}: expected {size} finite numbers.")
 
 
 def _check_positive(layout: Mapping[str, Any], key: str, where: str) -> None:
     value = layout.get(key)
     if not _is_number(value) or np.float32(value) <= 0:
-        raise PolicyError(f"{where}.{key} is {show(value)}: expected a number above 0.")
+        raise PolicyError(f"{where}.{key} is {short_json(value)}: expected a number above 0.")
 
 
 def action_layout(messages: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -296,7 +300,7 @@ def _check_action(layout: Mapping[str, Any], messages: int) -> int:
         found = layout.get(key)
         if not isinstance(found, list | tuple) or tuple(found) != expected:
             raise PolicyError(
-                f"meta.action.{key} is {show(found)}: expected {show(list(expected))}."
+                f"meta.action.{key} is {short_json(found)}: expected {short_json(list(expected))}."
             )
     for key in ("low", "high"):
         _check_numbers(layout, key, len(every[0]), "meta.action")
@@ -305,7 +309,7 @@ def _check_action(layout: Mapping[str, Any], messages: int) -> int:
     sound = low == [0, -high[1], *(-x for x in said)] and high[2:] == said
     if (np.array(high, np.float32) <= 0).any() or not sound:
         raise PolicyError(
-            f"meta.action.low is {show(low)} and high is {show(high)}: expected "
+            f"meta.action.low is {short_json(low)} and high is {short_json(high)}: expected "
             "a speed from 0 to high and a turn rate from -high to high"
             f"{', and messages from -1 to 1' if messages else ''}."
         )
@@ -331,7 +335,7 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
 def _check_preset(mapping: Mapping[str, Any], where: str) -> None:
     value = mapping.get("preset")
     if not _is_name(value):
-        raise PolicyError(f"{where}.preset is {show(value)}: expected the name of a preset.")
+        raise PolicyError(f"{where}.preset is {short_json(value)}: expected the name of a preset.")
 
 
 def _is_name(value: object) -> bool:
@@ -440,7 +444,7 @@ def _shapes(
     return shapes
 
 
-def show(value: object) -> str:
+def short_json(value: object) -> str:
     """Formats a value as JSON of 80 characters at most, for an error message.
 
     Args:
