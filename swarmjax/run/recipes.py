@@ -2,14 +2,16 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from swarmjax.config import files
-from swarmjax.config.section import ConfigError, Section
+from swarmjax.config import ConfigError, Section, files, show
 
 
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
     """Replaces `recipe=NAME` by the words of the recipe. Typed words override them.
+
+    A recipe may name another one with the key `recipe`. It takes the words of that recipe first.
 
     Args:
       cls: the command's dataclass.
@@ -25,16 +27,39 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
     chosen = [files.choice_of(word) for word in typed if word.startswith("recipe=")]
     if not chosen or chosen[-1] in ("", "null"):
         return others
-    path = files.named_path("recipes", chosen[-1], "recipe")
+    path, chain = files.named_path("recipes", chosen[-1], "recipe"), list[Path]()
+    words = others
+    while path is not None:
+        own, base = _read(cls, path)
+        words = [*own, *words]
+        chain.append(path.resolve())
+        if base is not None and base.resolve() in chain:
+            raise ConfigError(f"{path} goes on from {base}, which goes on from it: remove one.")
+        path = base
+    return words
+
+
+def _read(cls: type[Section], path: Path) -> tuple[list[str], Path | None]:
+    """Returns the own words of a recipe, and the file of the recipe that it goes on from."""
     found = files.read_yaml(path)
-    if "recipe" in found:
-        raise ConfigError(f"{path} names another recipe: remove the key recipe.")
+    base = found.pop("recipe", None)
     words = list(_words(found))
     try:
         files.split_words(cls, words)
+        return words, _base(path, base)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    return [*words, *others]
+
+
+def _base(path: Path, choice: Any) -> Path | None:
+    """Returns the file that the key `recipe` of a file names; None if it names none."""
+    if choice is None:
+        return None
+    if not isinstance(choice, str):
+        raise ConfigError(f"recipe is {show(choice)}: give the name of a recipe, or a file .yaml.")
+    # A relative path is meant from the folder of the file, as in a sequence of stages.
+    named = str(path.parent / choice) if files.is_path(choice) else choice
+    return files.named_path("recipes", named, "recipe")
 
 
 def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:

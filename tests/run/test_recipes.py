@@ -53,16 +53,42 @@ def test_a_recipe_may_leave_the_number_of_arenas_open(own: Path) -> None:
 
 
 def test_an_unknown_recipe_is_refused() -> None:
+    known = ", ".join(files.choices("recipes"))
     assert refusal(load_train, ["recipe=world"]) == (
-        "recipe is 'world': give one of worlds (nearest: worlds), or a file .yaml."
+        f"recipe is 'world': give one of {known} (nearest: worlds), or a file .yaml."
     )
 
 
-def test_a_recipe_in_a_recipe_is_refused(own: Path) -> None:
-    own.write_text("recipe: worlds\n")
-    assert refusal(load_train, [f"recipe={own}"]) == (
-        f"{own} names another recipe: remove the key recipe."
-    )
+def test_a_recipe_may_go_on_from_another(own: Path) -> None:
+    other = own.with_name("other.yaml")
+    other.write_text("recipe: mine.yaml\nbudget: 1e6\nalgo:\n  hidden_sizes: [8]\n")
+    expected = load_train([f"recipe={own}", "budget=1e6", "algo.hidden_sizes=[8]"])
+    assert to_dict(load_train([f"recipe={other}"])) == to_dict(expected)
+
+
+def test_a_recipe_may_go_on_from_one_of_the_project(own: Path) -> None:
+    own.write_text("recipe: worlds\nbudget: 1e6\n")
+    assert load_train([f"recipe={own}"]) == load_train(["recipe=worlds", "budget=1e6"])
+
+
+@pytest.mark.parametrize("base", ["mine.yaml", "other.yaml", "../{folder}/other.yaml"])
+def test_a_recipe_that_goes_on_from_itself_is_refused(own: Path, base: str) -> None:
+    own.write_text(f"recipe: {base.format(folder=own.parent.name)}\n")
+    own.with_name("other.yaml").write_text("recipe: mine.yaml\n")
+    said = refusal(load_train, [f"recipe={own}"])
+    assert said.endswith("which goes on from it: remove one.")
+
+
+@pytest.mark.parametrize(
+    ("base", "expected"),
+    [
+        ("world", "recipe is 'world': give one of worlds"),
+        ("[worlds]", "recipe is ['worlds']: give the name of a recipe, or a file .yaml."),
+    ],
+)
+def test_a_wrong_base_names_the_file(own: Path, base: str, expected: str) -> None:
+    own.write_text(f"recipe: {base}\n")
+    assert refusal(load_train, [f"recipe={own}"]).startswith(f"{own}: {expected}")
 
 
 def test_an_unknown_key_names_the_file(own: Path) -> None:
