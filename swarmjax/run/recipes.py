@@ -11,7 +11,8 @@ from swarmjax.config import ConfigError, Section, files, show
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
     """Replaces `recipe=NAME` by the words of the recipe. Typed words override them.
 
-    A recipe may name another one with the key `recipe`. It takes the words of that recipe first.
+    A recipe may extend another one, which the key `recipe` names. Its own words override the
+    other's.
 
     Args:
       cls: the command's dataclass.
@@ -34,13 +35,16 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
         words = [*own, *words]
         chain.append(path.resolve())
         if base is not None and base.resolve() in chain:
-            raise ConfigError(f"{path} goes on from {base}, which goes on from it: remove one.")
+            raise ConfigError(
+                f"{path} extends {base}, which extends it in turn: remove the key recipe from one "
+                "of them."
+            )
         path = base
     return words
 
 
 def _read(cls: type[Section], path: Path) -> tuple[list[str], Path | None]:
-    """Returns the own words of a recipe, and the file of the recipe that it goes on from."""
+    """Returns the own words of a recipe, and the file of the recipe that it extends."""
     found = files.read_yaml(path)
     base = found.pop("recipe", None)
     words = list(_words(found))
@@ -59,7 +63,10 @@ def _base(path: Path, choice: Any) -> Path | None:
         raise ConfigError(f"recipe is {show(choice)}: give the name of a recipe, or a file .yaml.")
     # A relative path is meant from the folder of the file, as in a sequence of stages.
     named = str(path.parent / choice) if files.is_path(choice) else choice
-    return files.named_path("recipes", named, "recipe")
+    base = files.named_path("recipes", named, "recipe")
+    if not base.is_file():  # also a loop of links
+        raise ConfigError(f"recipe is {show(choice)}, and there is no such file.")
+    return base
 
 
 def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:

@@ -59,24 +59,29 @@ def test_an_unknown_recipe_is_refused() -> None:
     )
 
 
-def test_a_recipe_may_go_on_from_another(own: Path) -> None:
+def test_a_recipe_may_extend_another(own: Path) -> None:
     other = own.with_name("other.yaml")
     other.write_text("recipe: mine.yaml\nbudget: 1e6\nalgo:\n  hidden_sizes: [8]\n")
     expected = load_train([f"recipe={own}", "budget=1e6", "algo.hidden_sizes=[8]"])
     assert to_dict(load_train([f"recipe={other}"])) == to_dict(expected)
 
 
-def test_a_recipe_may_go_on_from_one_of_the_project(own: Path) -> None:
+def test_recipes_may_form_a_chain(own: Path) -> None:
     own.write_text("recipe: worlds\nbudget: 1e6\n")
-    assert load_train([f"recipe={own}"]) == load_train(["recipe=worlds", "budget=1e6"])
+    third = own.with_name("third.yaml")
+    third.write_text("recipe: mine.yaml\nseed: 3\n")
+    expected = load_train(["recipe=worlds", "budget=2e6", "seed=3"])
+    assert load_train([f"recipe={third}", "budget=2e6"]) == expected
 
 
 @pytest.mark.parametrize("base", ["mine.yaml", "other.yaml", "../{folder}/other.yaml"])
-def test_a_recipe_that_goes_on_from_itself_is_refused(own: Path, base: str) -> None:
+def test_a_recipe_that_extends_itself_is_refused(own: Path, base: str) -> None:
     own.write_text(f"recipe: {base.format(folder=own.parent.name)}\n")
     own.with_name("other.yaml").write_text("recipe: mine.yaml\n")
     said = refusal(load_train, [f"recipe={own}"])
-    assert said.endswith("which goes on from it: remove one.")
+    end = ".yaml, which extends it in turn: remove the key recipe from one of them."
+    assert said.startswith(f"{own.parent}/")
+    assert said.endswith(end)
 
 
 @pytest.mark.parametrize(
@@ -89,6 +94,15 @@ def test_a_recipe_that_goes_on_from_itself_is_refused(own: Path, base: str) -> N
 def test_a_wrong_base_names_the_file(own: Path, base: str, expected: str) -> None:
     own.write_text(f"recipe: {base}\n")
     assert refusal(load_train, [f"recipe={own}"]).startswith(f"{own}: {expected}")
+
+
+@pytest.mark.parametrize("base", ["missing.yaml", "link.yaml"])
+def test_a_base_that_cannot_be_found_is_refused(own: Path, base: str) -> None:
+    own.with_name("link.yaml").symlink_to("link.yaml")
+    own.write_text(f"recipe: {base}\n")
+    assert refusal(load_train, [f"recipe={own}"]) == (
+        f"{own}: recipe is '{base}', and there is no such file."
+    )
 
 
 def test_an_unknown_key_names_the_file(own: Path) -> None:
