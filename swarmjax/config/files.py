@@ -80,6 +80,16 @@ def is_path(choice: str) -> bool:
     return choice.endswith((".yaml", ".yml"))
 
 
+def beside(folder: Path, choice: str) -> str:
+    """Returns a choice made in a user's file; a relative path is meant from that file's folder.
+
+    Args:
+      folder: the folder of the file that makes the choice.
+      choice: the name of a file in configs/, or the path of another file.
+    """
+    return str(folder / choice) if is_path(choice) else choice
+
+
 def _is_of(word: str, groups: Mapping[str, str]) -> bool:
     """Returns whether a word chooses a file for one of these groups, or sets a key in one."""
     return word.removeprefix("++").partition("=")[0].partition(".")[0] in groups

@@ -61,9 +61,7 @@ def _base(path: Path, choice: Any) -> Path | None:
         return None
     if not isinstance(choice, str):
         raise ConfigError(f"recipe is {show(choice)}: give the name of a recipe, or a file .yaml.")
-    # A relative path is meant from the folder of the file, as in a sequence of stages.
-    named = str(path.parent / choice) if files.is_path(choice) else choice
-    base = files.named_path("recipes", named, "recipe")
+    base = files.named_path("recipes", files.beside(path.parent, choice), "recipe")
     if not base.is_file():  # also a loop of links
         raise ConfigError(f"recipe is {show(choice)}, and there is no such file.")
     return base

@@ -110,7 +110,7 @@ def _listed(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
         stage, choice, "sequence", f"a curriculum: choose one stage, as in stage={names[-1]}"
     )
     folder = Path(choice).parent if files.is_path(choice) else Path()
-    return [_member(str(folder / name) if files.is_path(name) else name) for name in names]
+    return [_member(files.beside(folder, name)) for name in names]
 
 
 def _grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
