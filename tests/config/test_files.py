@@ -113,6 +113,13 @@ def test_a_stage_is_one_file(own_configs):
     assert [stage.robots for stage in train.stage] == [2, 4]
 
 
+def test_a_path_in_a_sequence_is_meant_from_the_folder_of_its_file(tmp_path):
+    (tmp_path / "wide.yaml").write_text("name: wide\nrobots: 4\nside: 3\n")
+    (tmp_path / "mine.yaml").write_text("sequence: [s1, wide.yaml]\n")
+    train = load_train([f"stage={tmp_path / 'mine.yaml'}"])
+    assert [stage.name for stage in train.stage] == ["s1", "wide"]
+
+
 def test_a_grid_is_one_file(own_configs):
     axes = "grid: {robots: [1, 2], obstacles: [1], side: [1, 2]}\n"
     (own_configs / "stage" / "mine.yaml").write_text(axes)
