@@ -27,7 +27,7 @@ RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest", "playground": "hi
 # Libraries that share an environment with swarmjax: more extras, and what calls them.
 EXTRAS = {"playground": ["playground"]}
 TOLD = ("jax", "flax", "optax", "orbax-checkpoint", "chex", "numpy", "mujoco-mjx", "warp-lang")
-TOLD += ("hydra-core", "omegaconf", "matplotlib", "rich", "tensorboardx", "playground", "brax")
+TOLD += ("matplotlib", "rich", "tensorboardx", "playground", "brax")
 # Tests of what calls JAX, Flax, Optax and MuJoCo most; brax is not installed, and a test that
 # switches JAX to 64 bits does so as only JAX 0.8 and later can.
 TESTS = [

@@ -50,7 +50,7 @@ class FidelityConfig(Section):
 
 def load(arguments: Sequence[str]) -> FidelityConfig:
     """Makes the settings from `key=value` words; raises ConfigError if a word is invalid."""
-    return build(FidelityConfig, files.values(files.split_words(FidelityConfig, arguments)))
+    return build(FidelityConfig, files.nest(files.parse(FidelityConfig, arguments)))
 
 
 def rigs() -> list[Rig]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmjax import extension, policy_file
-from swarmjax.config import ConfigError, Section, inherit, show, to_dict
+from swarmjax.config import ConfigError, Section, files, show, to_dict
 from swarmjax.policy import Policy, PolicyError
 from swarmjax.run.errors import CheckpointError, TrainingError
 
@@ -154,10 +154,10 @@ def train_policy(
     else:
         more = {} if extensions is None else {"extensions": extensions}
         config, auto = load_run(*_given({**_mapping(settings), **more}))
-    run, files = quiet.train(
+    run, paths = quiet.train(
         config, on_update or (lambda row: None), _signals, loggers=_loggers(log), auto=auto
     )
-    policies = [policy_file.read(file, config.extensions) for file in files]
+    policies = [policy_file.read(file, config.extensions) for file in paths]
     lines = (run / "metrics.jsonl").read_text().splitlines()
     return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
 
@@ -295,7 +295,7 @@ def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
         elif isinstance(value, str | Path):  # names, paths and typed values
             found[f"{where}{key}"] = str(value)
         else:
-            found[f"{where}{key}"] = inherit.write(value)
+            found[f"{where}{key}"] = files.write(value)
     return found
 
 

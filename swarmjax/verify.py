@@ -126,8 +126,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command and returns its exit code."""
     settings: VerifyConfig = files.load(VerifyConfig, arguments)
     trained = from_stored(read_config(Path(settings.run)), "stored ")
-    if settings.extensions is not None:
-        trained = replace(trained, extensions=settings.extensions)
+    trained = replace(trained, extensions=settings.extensions)
     saved = load_digests(settings, trained)
     found = replay(settle(trained), list(saved))
     differing = [update for update in saved if found[update] != saved[update]]

@@ -37,7 +37,6 @@ DIRECT = [
 DISTRIBUTIONS = {
     "PIL": "pillow",
     "absl": "absl-py",
-    "hydra": "hydra-core",
     "imageio_ffmpeg": "imageio",
     "orbax": "orbax-checkpoint",
     "warp": "warp-lang",

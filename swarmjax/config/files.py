@@ -1,49 +1,48 @@
-"""Composes the files of configs/ and the words of a command line into plain data, with Hydra.
+"""Composes the files of configs/ and the words of a command line into plain data.
 
-Hydra only composes the YAML files with the `key=value` words. Here Hydra sets up no logging and
-does not change the directory. It is imported on first use. `section.build` takes the result.
+Files and values of words are YAML 1.2. Nothing in them is evaluated: `${...}` is text like any
+other. `section.build` takes the result.
 """
 
-import contextlib
 import difflib
-import itertools
+import json
 import re
-import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 from swarmjax.config import reading, section
 from swarmjax.config.section import ConfigError, Section, show
 
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
 _PACKAGE = Path(__file__).resolve().parents[1]
-
-# Limits on a word of the command line. Hydra's grammar takes seconds to read longer words.
-_MOST_KEY = 200  # letters
-_MOST_VALUE = 5000  # letters
-_MOST_DEPTH = 32  # nested brackets
-# In all words together. A reference may contain several others, so only a few more references would
-# fill the memory.
-_MOST_REFERENCES = 16
+_MOST_KEY = 200  # letters of a key on the command line
 
 # Groups whose message about an unknown choice says that a path is allowed.
 _OWN_FILES = ("stage", "recipes")
+# The group whose files set keys of all sections, as `algo=paper` does, and not only its own.
+_WHOLE = "algo"
 
 # Takes the composed data and the choice of each group, and returns the keys and values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
-def compose(
-    cls: type[Section], command: str, overrides: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Composes a command's files and words with Hydra.
+class Overrides(NamedTuple):
+    """Settings from one source, which override those of earlier sources.
+
+    Attributes:
+      choices: the file that the source chooses for a group, by group.
+      values: other settings, as nested plain data.
+    """
+
+    choices: dict[str, str]
+    values: dict[str, Any]
+
+
+def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Composes a command's files and words. Words override files.
 
     Args:
       cls: the command's dataclass, which defines its keys.
-      command: name of the command's file in configs/.
       overrides: `key=value` words.
 
     Returns:
@@ -52,27 +51,68 @@ def compose(
     Raises:
       ConfigError: if a word, a choice or a file is invalid.
     """
-    words = split_words(cls, overrides)
-    groups = {key: choice_of(word) for key, word in words.items() if choices(key)}
-    own = {key: choice for key, choice in groups.items() if is_path(choice)}
-    for key, choice in groups.items():
-        check_choice(key, choice, key)
-    for key in words.keys() - groups.keys():
-        _parse(words[key])
-    for group, choice in (defaults(command) | groups).items():
-        read_choice(group, choice)  # this error names a broken file, but Hydra's error does not
-    forced = [word if key in groups else f"++{word}" for key, word in words.items()]
-    composed, chosen = _hydra(command, [word for word in forced if not _is_of(word, own)])
-    mapping = _resolve(composed)
-    for group, path in own.items():
-        mine = {key: word for key, word in words.items() if key.startswith(f"{group}.")}
-        mapping[group] = _merge(read_choice(group, path), values(mine).get(group, {}))
-    return mapping, chosen | own
+    flat = parse(cls, overrides)
+    choices_of = {key: choice for key, choice in flat.items() if choices(key)}
+    typed = Overrides(choices_of, nest({k: v for k, v in flat.items() if k not in choices_of}))
+    first = Overrides(defaults(cls.command), {})
+    whole = _of_whole(cls, (first.choices | typed.choices).get(_WHOLE))
+    chosen = first.choices | whole.choices | typed.choices
+    found: dict[str, Any] = {}
+    for group, choice in chosen.items():
+        check_choice(group, choice, group)
+        if group != _WHOLE:
+            found[group] = read_choice(group, choice)
+    return merge(merge(found, whole.values), typed.values), chosen
 
 
-def choice_of(word: str) -> str:
-    """Returns the choice that a word makes for a group."""
-    return word.partition("=")[2].strip("'\"")
+def _of_whole(cls: type[Section], choice: str | None) -> Overrides:
+    """Reads the file of a group that may set keys of all sections."""
+    if choice is None:
+        return Overrides({}, {})
+    check_choice(_WHOLE, choice, _WHOLE)
+    found = read_choice(_WHOLE, choice)
+    if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
+        found = {_WHOLE: found}
+    check_shared(cls, found, choice)
+    return of_file(found, Path(choice).parent if is_path(choice) else Path())
+
+
+def of_file(found: Mapping[str, Any], folder: Path) -> Overrides:
+    """Separates the choices in a file from its other settings.
+
+    Args:
+      found: the keys and values of the file.
+      folder: the folder of the file. Relative paths in it are meant from there.
+    """
+    chosen = {
+        key: beside(folder, value)
+        for key, value in found.items()
+        if isinstance(value, str) and choices(key)
+    }
+    return Overrides(chosen, {key: value for key, value in found.items() if key not in chosen})
+
+
+def check_shared(cls: type[Section], found: Mapping[str, Any], path: str | Path) -> None:
+    """Refuses keys that a file from somebody else must not set.
+
+    Args:
+      cls: the command's dataclass. Its `shared` lists the keys and sections that such a file may
+        set.
+      found: the keys and values of the file.
+      path: the file, for messages.
+
+    Raises:
+      ConfigError: if there is another key.
+    """
+    for key in found:
+        root = key.partition(".")[0]
+        if root not in section.names(cls):
+            raise ConfigError(f"{path}: {section.unknown_key(root, cls)}")
+        if root not in cls.shared:
+            raise ConfigError(
+                f"{path}: {key} cannot be set by a file, which may set {', '.join(cls.shared)}: "
+                f"remove it, and give {key} on the command line."
+            )
 
 
 def is_path(choice: str) -> bool:
@@ -90,18 +130,18 @@ def beside(folder: Path, choice: str) -> str:
     return str(folder / choice) if is_path(choice) else choice
 
 
-def _is_of(word: str, groups: Mapping[str, str]) -> bool:
-    """Returns whether a word chooses a file for one of these groups, or sets a key in one."""
-    return word.removeprefix("++").partition("=")[0].partition(".")[0] in groups
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns nested plain data with some keys replaced.
 
-
-def _merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested plain data with some keys replaced."""
+    Args:
+      base: the data.
+      over: the keys to replace, nested in the same way.
+    """
     found = dict(base)
     for key, value in over.items():
         inner = found.get(key)
-        if isinstance(inner, dict) and isinstance(value, Mapping):
-            value = _merge(inner, value)
+        if isinstance(inner, Mapping) and isinstance(value, Mapping):
+            value = merge(inner, value)
         found[key] = value
     return found
 
@@ -121,7 +161,7 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
-    mapping, chosen = compose(cls, cls.command, overrides)
+    mapping, chosen = compose(cls, overrides)
     return section.build(cls, complete(mapping, chosen) if complete else mapping)
 
 
@@ -134,14 +174,8 @@ def choices(group: str) -> list[str]:
 
 
 def defaults(command: str) -> dict[str, str]:
-    """Returns the groups of a command and the choices in its file."""
-    entries = read_file(command).get("defaults", [])
-    return {
-        str(group): str(choice)
-        for entry in entries
-        if isinstance(entry, dict)
-        for group, choice in entry.items()
-    }
+    """Returns the groups of a command and the choices in its file; none if it has no file."""
+    return read_file(command) if (_config_dir() / f"{command}.yaml").exists() else {}
 
 
 def describe_groups(cls: type[Section]) -> list[str]:
@@ -188,17 +222,12 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
       choice: the name of a file in that folder, or the path of another file.
 
     Raises:
-      ConfigError: if the file cannot be read, or if it is a user's file that chooses other files.
+      ConfigError: if the file cannot be read.
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
     section.check_text(group, choice)
-    found = read_yaml(Path(choice))
-    if "defaults" in found:
-        raise ConfigError(
-            f"{choice} has defaults, which only files of configs/ may have: remove it."
-        )
-    return found
+    return read_yaml(Path(choice))
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -214,7 +243,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{reading.called(path)} is not a list of keys and values: write key: value."
         )
-    return {str(key): value for key, value in mapping.items()}
+    return mapping
 
 
 def read_preset(group: str, choice: str) -> dict[str, Any]:
@@ -244,7 +273,7 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     """Returns the file that a choice names: one of a folder of configs/, or a user's own.
 
     Args:
-      folder: a folder of configs/ that is not a group of Hydra.
+      folder: a folder of configs/ that is not a group of a command.
       choice: the name of a file in that folder, or the path of another file.
       key: name of the setting in messages.
 
@@ -289,181 +318,80 @@ def check_choice(group: str, choice: str, key: str) -> None:
 # Words
 
 
-def split_words(cls: type[Section], overrides: Sequence[str]) -> dict[str, str]:
-    """Returns the words of a command line by key. If a key is given twice, the last word counts.
+def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
+    """Returns the values of a command line by key. If a key is given twice, the last word counts.
 
     Args:
       cls: the command's dataclass.
       overrides: `key=value` words.
 
     Returns:
-      The words, with text quoted for Hydra's grammar.
+      Plain data. The value of a group is the choice of its file.
 
     Raises:
-      ConfigError: if a word is not `key=value`, if its key is not in `cls`, or if its key can only
-        be set by choosing a file.
+      ConfigError: if a word is not `key=value`, if its key is not in `cls`, if its key can only be
+        set by choosing a file, or if its value is not YAML.
     """
-    roots, derived = section.names(cls), section.keys(cls, derived=True)
-    words = {}
+    known, derived = section.keys(cls), section.keys(cls, derived=True)
+    found = {}
     for word in overrides:
-        key, equals, _ = word.partition("=")
+        key, equals, value = word.partition("=")
         if not equals or len(key) > _MOST_KEY or not re.fullmatch(r"\w[\w-]*(\.[\w-]+)*", key):
             raise ConfigError(f"{show(word)} is not a setting: give key=value.")
         root = key.partition(".")[0]
-        if root not in roots:
+        if root not in section.names(cls):
             raise section.unknown_key(root, cls)
         if key in derived:
             raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
-        words[key] = word
-    texts = {key for key, item in section.keys(cls).items() if str in section.options(item.type)}
-    for key, word in words.items():
-        _check_word(key, word, is_text=key in texts)
-    if sum(word.count("${") for word in words.values()) > _MOST_REFERENCES:
-        raise ConfigError(
-            f"the arguments use ${{...}} too often: use it at most {_MOST_REFERENCES} times."
-        )
-    return {key: _quote(word) if key in texts else word for key, word in words.items()}
+        if choices(key):
+            section.check_text(key, value)
+            found[key] = value.strip("'\"")
+        elif key in known and str in section.options(known[key].type):
+            found[key] = _text(key, value)
+        else:
+            found[key] = _value(key, value)
+    return found
 
 
-def _check_word(key: str, word: str, *, is_text: bool) -> None:
-    """Refuses words that would take Hydra's grammar too long, and invalid text."""
-    value = word.partition("=")[2]
-    if is_text or choices(key):
-        section.check_text(key, value)
-    elif len(value) > _MOST_VALUE:
-        raise ConfigError(
-            f"{key} is {show(value)}, which has {len(value)} characters: give at most "
-            f"{_MOST_VALUE}."
-        )
-    elif _depth(value) > _MOST_DEPTH:
-        raise ConfigError(f"{key} is {show(value)}: nest lists at most {_MOST_DEPTH} deep.")
+def _text(key: str, value: str) -> Any:
+    """Reads a text, which needs no quotes, so that a path may contain any character."""
+    section.check_text(key, value)
+    if value == "null":
+        return None
+    return _value(key, value) if value[:1] in ("'", '"') else value
 
 
-def _depth(value: str) -> int:
-    """Returns the maximum depth of nested brackets in a word."""
-    steps = (("[{(".count(letter)) - ("]})".count(letter)) for letter in value)
-    return max(itertools.accumulate(steps), default=0)
+def _value(key: str, value: str) -> Any:
+    return reading.parse_yaml(value, f"{key} is {show(value)}, which cannot be read: ")
 
 
-def values(words: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the values of words as nested plain data.
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values of dotted keys as nested plain data.
 
     Args:
-      words: the words, as `split_words` returns them.
+      flat: values by dotted key. Later ones override earlier ones.
 
     Raises:
-      ConfigError: if Hydra's grammar cannot read a word, or two words contradict each other.
+      ConfigError: if a key continues below another key's value.
     """
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    given = OmegaConf.create({})
-    for key, word in words.items():
-        try:
-            with _explained([word]):
-                OmegaConf.update(given, key, _parse(word))
-        except OmegaConfBaseException as error:
-            raise ConfigError(f"{show(word)} cannot be used: {_first_line(error)}.") from None
-    return _resolve(given)
-
-
-def _quote(word: str) -> str:
-    """Quotes a text for Hydra's grammar, so that a path may contain `=`, a comma or a space."""
-    key, _, value = word.partition("=")
-    if value in ("", "null") or value[0] in "'\"":
-        return word
-    return f"{key}={quote(value)}"
+    found: dict[str, Any] = {}
+    for key, value in flat.items():
+        *above, last = key.split(".")
+        inner = found
+        for depth, part in enumerate(above, 1):
+            inner = inner.setdefault(part, {})
+            if not isinstance(inner, dict):
+                whole = ".".join(above[:depth])
+                raise ConfigError(
+                    f"{key} is not a key, since {whole} is {show(inner)}: leave one of them out."
+                )
+        inner[last] = value
+    return found
 
 
-def quote(text: str) -> str:
-    """Quotes a text so that Hydra's grammar reads it unchanged."""
-    from hydra.core.override_parser.types import Quote, QuotedString
-
-    return QuotedString(text=text, quote=Quote.single).with_quotes()
-
-
-def _parse(word: str) -> object:
-    """Parses one word with Hydra's grammar and returns its value."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    key = word.partition("=")[0]
-    try:
-        parsed = OverridesParser.create().parse_override(f"++{word}")
-    except (ValueError, OverflowError):  # a number is too long; Hydra has no error for this
-        raise ConfigError(f"{show(word)} cannot be used: give a number of fewer digits.") from None
-    except HydraException:
-        raise ConfigError(
-            f"{show(word)} cannot be read: quote a value with special characters, "
-            f"as in \"{key}='a=b'\"."
-        ) from None
-    if parsed.is_sweep_override():
-        raise ConfigError(
-            f"{show(word)} gives several values, and a run takes one: write a list as {key}=[1,2]."
-        )
-    return parsed.value()
-
-
-# Hydra
-
-
-def _hydra(command: str, overrides: list[str]) -> tuple["DictConfig", dict[str, str]]:
-    """Composes with a separate Hydra instance, and then restores the caller's instance, if any.
-
-    Hydra also returns the choice of each group, because a file may choose files of other groups.
-    """
-    import hydra
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-    from omegaconf import open_dict
-    from omegaconf.errors import OmegaConfBaseException
-    from yaml import YAMLError
-
-    outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with (
-            _explained(overrides),
-            hydra.initialize_config_dir(config_dir=str(_config_dir()), version_base="1.3"),
-        ):
-            composed = hydra.compose(command, overrides=overrides, return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ConfigError(f"the settings do not fit together: {_first_line(error)}.") from None
-    finally:
-        GlobalHydra.instance().hydra = outer
-    chosen = {group: composed.hydra.runtime.choices[group] for group in defaults(command)}
-    with open_dict(composed):
-        del composed["hydra"]
-    return composed, chosen
-
-
-@contextlib.contextmanager
-def _explained(words: Iterable[str]) -> Iterator[None]:
-    """Explains the error if a key continues inside a list, where OmegaConf expects an index."""
-    try:
-        yield
-    except (TypeError, ValueError) as error:
-        for word, part in itertools.product(words, re.findall(r"'([^']*)'", str(error))):
-            key = word.removeprefix("++").partition("=")[0]
-            start, within, _ = f"{key}.".partition(f".{part}.")
-            if within and not isinstance(error, ConfigError):
-                said = f"{key} is not a key: {start} is a list, give {start}=[...]."
-                raise ConfigError(said) from None
-        raise
-
-
-def _resolve(config: "DictConfig") -> dict[str, Any]:
-    """Returns Hydra's composed config as plain data, with its interpolations resolved."""
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        mapping = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except (OmegaConfBaseException, ValueError, RecursionError) as error:
-        raise ConfigError(f"the settings cannot be resolved: {_first_line(error)}.") from None
-    return typing.cast(dict[str, Any], mapping)
-
-
-def _first_line(error: Exception) -> str:
-    line = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-    return line if len(line) <= _MOST_KEY else f"{line[: _MOST_KEY - 3]}..."
+def write(value: Any) -> str:
+    """Writes plain data as the value of a word, so that `parse` reads the same data."""
+    plain = isinstance(value, str) and re.fullmatch(r"[A-Za-z][\w./-]*", value)
+    if plain and value.lower() not in ("null", "true", "false"):
+        return value
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))

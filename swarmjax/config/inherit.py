@@ -25,13 +25,13 @@ def group_words(
     Returns:
       A word for each value that differs from its default.
     """
-    words = files.split_words(cls, typed)
-    own = files.read_choice(group, files.choice_of(words[group])) if group in words else {}
+    given = files.parse(cls, typed)
+    own = files.read_choice(group, given[group]) if group in given else {}
     left = {*skip, *own.get(group, own)}  # in a file for the whole config, each group is nested
     cls_held = type(held)
     default, derived = section.to_dict(cls_held()), section.keys(cls_held, derived=True)
     return [
-        f"{group}.{key}={write(value)}"
+        f"{group}.{key}={files.write(value)}"
         for key, value in _differences(section.to_dict(held), default)
         if key not in derived and key.partition(".")[0] not in left
     ]
@@ -50,22 +50,14 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
       The choice of the preset, and a word for each value that differs from the preset. Nothing if
       another preset is typed.
     """
-    if group in files.split_words(cls, typed):
+    if group in files.parse(cls, typed):
         return []
     preset = section.build(type(held), files.read_preset(group, held.name))
     found = _differences(section.to_dict(held), section.to_dict(preset))
-    return [f"{group}={held.name}", *(f"{group}.{key}={write(value)}" for key, value in found)]
-
-
-def write(value: object) -> str:
-    """Writes plain data so that Hydra's grammar reads the same value."""
-    if isinstance(value, str):
-        return files.quote(value)
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(write, value))}]"
-    return repr(value)
+    return [
+        f"{group}={held.name}",
+        *(f"{group}.{key}={files.write(value)}" for key, value in found),
+    ]
 
 
 def _differences(held: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -6,20 +6,25 @@ values.
 """
 
 import contextlib
+import functools
 import json
 import os
+import re
 import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 from swarmjax.config.section import ConfigError, show
 
 MOST_TYPED = 2**20  # bytes in a file that a person writes; files of configs/ are 1000 times smaller
 MOST_MADE = 2**24  # bytes in a file that the project writes, such as a run's config
 _MOST_LINE = 2**24  # bytes in one line of a file with one object per line
-_MOST_NODES = 200_000  # values in a YAML file, after its aliases are expanded
+# Values in a YAML file, after its aliases are expanded. The largest file of configs/ has under 200.
+MOST_VALUES = 10_000
 _MOST_DEPTH = 32  # nested lists and mappings
+_TOO_DEEP = f"lists or mappings are nested more than {_MOST_DEPTH} deep."
+_MOST_DIGITS = 4300  # digits of a whole number; Python reads no more
 _MOST_SCALAR = 5000  # letters of one value; a path may have 4096
 
 
@@ -143,9 +148,7 @@ def _inside(value: object) -> Iterable[object]:
 
 
 def _too_deep(where: str) -> ConfigError:
-    return ConfigError(
-        f"{where} cannot be read: lists or mappings are nested more than {_MOST_DEPTH} deep."
-    )
+    return ConfigError(f"{where} cannot be read: {_TOO_DEEP}")
 
 
 def read_lines(path: Path) -> Iterator[bytes]:
@@ -175,24 +178,42 @@ def read_yaml(path: Path) -> Any:
       path: the file.
 
     Returns:
-      Its content as plain data. Text such as `1e6` is read as a number, and a date as text.
+      Its content as plain data.
 
     Raises:
-      ConfigError: as in `read_text`, or if the file is not YAML or expands to too many values.
+      ConfigError: as in `read_text` and `parse_yaml`.
+    """
+    return parse_yaml(read_text(path), f"{called(path)} cannot be read: ")
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Parses a YAML text with the scalars of YAML 1.2: text, numbers, true, false and null.
+
+    Args:
+      text: the whole text.
+      where: the beginning of messages about it.
+
+    Returns:
+      Its content as plain data. `1e6` is a number; a date and `yes` are text.
+
+    Raises:
+      ConfigError: if the text is not YAML, has a tag, expands to too many values, or has a key that
+        is not text.
     """
     import yaml
 
-    text, where = read_text(path), called(path)
     loader = _loader()
     try:
         _measure(yaml.parse(text, loader), where)
         return yaml.load(text, loader)
     except ConfigError:
         raise
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
-    except (ValueError, TypeError, OverflowError) as error:  # an invalid number or key
-        raise ConfigError(f"{where} cannot be read: {_first_line(error)}.") from None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise ConfigError(f"{where}{error.problem}{place}.") from None
+    except (yaml.YAMLError, ValueError) as error:  # letters, keys and numbers that are not allowed
+        raise ConfigError(f"{where}{_first_line(error)}.") from None
 
 
 class _Open:
@@ -203,11 +224,13 @@ class _Open:
 
 
 def _measure(events: Iterable[Any], where: str) -> None:
-    """Refuses a YAML text that expands to too many values or is nested too deeply."""
+    """Refuses a YAML text that has tags, expands to too many values or is nested too deeply."""
     import yaml
 
     anchors, within = dict[str | None, int](), [_Open(None)]
     for event in events:
+        if getattr(event, "tag", None) is not None:
+            raise ConfigError(f"{where}it has the tag {show(event.tag)}: remove it.")
         if isinstance(event, yaml.CollectionStartEvent):
             within.append(_Open(event.anchor))
         elif isinstance(event, yaml.CollectionEndEvent):
@@ -225,49 +248,70 @@ def _measure(events: Iterable[Any], where: str) -> None:
 
 def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
     if anchor in [each.anchor for each in within]:
-        raise ConfigError(f"{where} cannot be read: *{anchor} contains itself.")
+        raise ConfigError(f"{where}*{anchor} contains itself.")
 
 
 def _check_scalar(value: str, where: str) -> None:
     if len(value) > _MOST_SCALAR:
-        most = f"a value has more than {_MOST_SCALAR} characters"
-        raise ConfigError(f"{where} cannot be read: {most}.")
+        raise ConfigError(f"{where}a value has more than {_MOST_SCALAR} characters.")
 
 
 def _check_room(within: list[_Open], where: str) -> None:
     if len(within) > _MOST_DEPTH:
-        raise _too_deep(where)
-    if within[-1].values > _MOST_NODES:
-        raise ConfigError(f"{where} cannot be read: it has more than {_MOST_NODES} values.")
+        raise ConfigError(f"{where}{_TOO_DEEP}")
+    if within[-1].values > MOST_VALUES:
+        raise ConfigError(f"{where}it has more than {MOST_VALUES} values.")
 
 
+# The scalars of YAML 1.2's core schema (yaml.org/spec/1.2.2, section 10.3.2), by PyYAML's name for
+# them: the pattern, and the letters that may come first. Anything else is text.
+_SCALARS = {
+    "null": (r"null|Null|NULL|~|", ["n", "N", "~", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
+    "int": (r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", [*"-+0123456789"]),
+    "float": (
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        [*"-+0123456789."],
+    ),
+}
+
+
+@functools.cache
 def _loader() -> Any:
-    """Makes the YAML loader with Hydra's rules, in C if available."""
+    """Makes the YAML loader, in C if available."""
     import yaml
-    from omegaconf._utils import get_yaml_loader
 
-    plain: Any = get_yaml_loader()
     base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
     class Loader(base):
-        yaml_implicit_resolvers = plain.yaml_implicit_resolvers
+        yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            _check_once(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-            return super().construct_mapping(node, deep=deep)
+            found = dict[str, Any]()
+            for key, value in node.value:
+                name = self.construct_object(key, deep=True)
+                if not isinstance(name, str):
+                    raise ValueError(f"key {show(name)} is not text")
+                if name in found:
+                    raise ValueError(f"key {show(name)} is there twice")
+                found[name] = self.construct_object(value, deep=deep)
+            return found
 
+    for name, (pattern, first) in _SCALARS.items():
+        tag = f"tag:yaml.org,2002:{name}"
+        Loader.add_implicit_resolver(tag, re.compile(f"^(?:{pattern})$"), first)
+    Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
     return Loader
 
 
-def _check_once(keys: Iterable[str]) -> None:
-    found = set[str]()
-    for key in keys:
-        if key in found and key != "<<":
-            raise ValueError(f"key {show(key)} is there twice")
-        found.add(key)
+def _whole_number(_: Any, node: Any) -> int:
+    """Reads a whole number. PyYAML would read 010 as 8, as in YAML 1.1."""
+    if len(node.value) > _MOST_DIGITS:
+        raise ValueError(f"a number has more than {_MOST_DIGITS} digits")
+    return int(node.value, {"0o": 8, "0x": 16}.get(node.value[:2], 10))
 
 
 def _first_line(error: Exception) -> str:
-    """Shortens a YAML error, with its position, to a part of a sentence."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    """Shortens an error to a part of a sentence."""
+    text = " ".join(str(error).split())
     return (text if len(text) <= 200 else f"{text[:197]}...").rstrip(".")

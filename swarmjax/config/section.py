@@ -109,12 +109,14 @@ class Section:
       removed: why a key was removed, by its old name.
       renamed: new names of keys, by old name.
       inherited: for each section by name, where its values come from if no word sets them.
+      shared: the keys and sections that a file for the whole config, such as a recipe, may set.
     """
 
     command: ClassVar[str] = ""
     removed: ClassVar[Mapping[str, str]] = {}
     renamed: ClassVar[Mapping[str, str]] = {}
     inherited: ClassVar[Mapping[str, str]] = {}
+    shared: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from swarmjax.config import ConfigError, Section, about, build, files, show
@@ -97,17 +98,18 @@ def read_suite(choice: str) -> SuiteFileConfig:
     mapping = files.read_yaml(path)
     cells = mapping.get("cells")
     if isinstance(cells, list):
-        mapping = mapping | {"cells": [_cell(cell) for cell in cells]}
+        mapping = mapping | {"cells": [_cell(cell, path.parent) for cell in cells]}
     try:
         return build(SuiteFileConfig, {"name": path.stem} | mapping)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _cell(cell: Any) -> Any:
-    """Fills in the numbers of the stage that a cell names."""
+def _cell(cell: Any, folder: Path) -> Any:
+    """Fills in the numbers of the stage that a cell names, perhaps with a file beside the suite."""
     stage = cell.get("stage") if isinstance(cell, Mapping) else None
     if isinstance(stage, str):
+        stage = files.beside(folder, stage)
         return {**cell, "stage": stage_files.pick_one(stage_files.read_stage(stage), stage)}
     if isinstance(stage, Mapping):
         return {**cell, "stage": complete({"name": cell.get("name"), **stage})}

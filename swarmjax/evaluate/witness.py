@@ -125,7 +125,7 @@ def load[C: Section](
 
 def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
     """Lists the policy files that the arguments name."""
-    given = files.values(files.split_words(cls, typed))
+    given = files.parse(cls, typed)
     policy, compare = (given.get(key) or "" for key in ("policy", "compare"))
     sides = [("policy", policy), *(("compare", part) for part in str(compare).split(","))]
     found = [path for key, text in sides if text for path in list_files(key, str(text))]
@@ -137,8 +137,8 @@ def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str
 
     The judge's body keeps its wheels if a robot file names no body.
     """
-    choice = files.split_words(cls, typed).get("robot")
-    own = {"body": BODY} if choice is None else files.read_choice("robot", files.choice_of(choice))
+    choice = files.parse(cls, typed).get("robot")
+    own = {"body": BODY} if choice is None else files.read_choice("robot", choice)
     return [
         *([] if "body" in own.get("robot", own) else [f"robot.body={BODY}"]),
         *inherit.group_words(cls, "robot", found.robot, typed, skip=["body"]),
@@ -151,7 +151,7 @@ def _check_alike(
     cls: type[Section], paths: list[str], words: list[list[str]], typed: Sequence[str]
 ) -> None:
     """Refuses policies that were trained differently, unless an argument decides."""
-    told = files.split_words(cls, typed)
+    told = files.parse(cls, typed)
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]

@@ -40,9 +40,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     run = Path(settings.run or "")
     trained = from_stored(read_config(run))
-    if settings.extensions is not None:
-        trained = replace(trained, extensions=settings.extensions)
-    trained = settle(trained)
+    trained = settle(replace(trained, extensions=settings.extensions))
     targets = _targets(settings, trained)
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:

@@ -130,14 +130,14 @@ def load_reproduce(
     """
     if stored is None:
         return files.load(ReproduceConfig, overrides)
-    words = files.split_words(ReproduceConfig, overrides)
-    for key, word in words.items():
+    words = files.parse(ReproduceConfig, overrides)
+    for key, value in words.items():
         if key not in _REPRODUCE_RESUME_KEYS:
             raise ConfigError(
-                f"{show(word, quote='')} cannot be given: resume keeps the rest of "
+                f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of "
                 f"the stored reproduction and takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
             )
     kept = to_dict(build(ReproduceConfig, modernise(ReproduceConfig, stored), "stored ")) | {
         "minutes": None
     }
-    return build(ReproduceConfig, kept | files.values(words))
+    return build(ReproduceConfig, kept | files.nest(words))

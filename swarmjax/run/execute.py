@@ -120,16 +120,15 @@ def _success(settings: TrainConfig, tally: Tally) -> str:
 
 def _closing(run: Path, settings: TrainConfig, tally: Tally) -> str:
     """Describes what to do next."""
+    code = [] if settings.extensions is None else [f"extensions={settings.extensions}"]
     if tally.update < settings.updates:
         saved = max(checkpoint.steps(run), default=0)
         how = "saved" if saved == tally.update else f"saved at update {saved:,}, the last sound one"
         return (
             f"stopped after update {tally.update:,} of {settings.updates:,}, {how}; go on with: "
-            f"{command.line('train', f'resume={run}')}"
+            f"{command.line('train', f'resume={run}', *code)}"
         )
     policy = seed_path(run / POLICY, settings, settings.seed)
-    arguments = [f"policy={policy}"]
-    if settings.extensions is not None:
-        arguments.append(f"extensions={settings.extensions}")
+    arguments = [f"policy={policy}", *code]
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
     return f"done; judge {what} with: {command.line('evaluate', *arguments)}"

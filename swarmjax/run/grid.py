@@ -14,7 +14,6 @@ from swarmjax.run.settings import TrainConfig
 
 GRID = "grid."
 MOST_CELLS = 256
-_MOST_LETTERS = 5000  # letters in one word of the grid
 # Keys that this module sets for each cell.
 _OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", "run.dry")
 
@@ -85,23 +84,11 @@ def _check_once(key: str, given: set[str]) -> None:
 
 
 def _values(key: str, text: str) -> list[str]:
-    """Splits the values of a key by Hydra's grammar: `1,2`, `[1,2],[3]` or `range(3)`."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    files.split_words(TrainConfig, [f"{key}={text}"])
-    if len(text) > _MOST_LETTERS:
-        raise ConfigError(f"{GRID}{key} has {len(text)} characters: give at most {_MOST_LETTERS}.")
-    try:
-        parsed = OverridesParser.create().parse_override(f"{key}={text}")
-        if not parsed.is_sweep_override():
-            return [text]
-        return list(itertools.islice(parsed.sweep_string_iterator(), MOST_CELLS + 1))
-    except (HydraException, ValueError, OverflowError):
-        raise ConfigError(
-            f"{GRID}{key} is {show(text)}, which cannot be read: give values with commas between "
-            "them, and quote those with special characters."
-        ) from None
+    """Splits the values of a key, which are a list in YAML: `1,2` or `[1,2],[3]`."""
+    found = reading.parse_yaml(f"[{text}]", f"{GRID}{key} is {show(text)}, which cannot be read: ")
+    words = [each if isinstance(each, str) else files.write(each) for each in found or [""]]
+    files.parse(TrainConfig, [f"{key}={word}" for word in words])
+    return words
 
 
 def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> list[GridCell]:

@@ -17,7 +17,7 @@ from swarmjax.task import pieces, stage_files
 AUTO = "auto"  # `arenas` and `resume` accept this word in place of a number or a directory
 
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
-_RESUME_KEYS = tuple("run.*" if key == "run" else key for key in MAY_CHANGE)
+_RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "extensions")
 
 # The algo keys that a run with init_from must share with the run that it starts from.
 _SHARED = (
@@ -35,6 +35,8 @@ _SHARED = (
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
     """Makes the configuration that a run directory or a policy holds, written by any version.
 
+    A file of extensions that it names is left out: only a command line or Python names code.
+
     Args:
       stored: the result of `to_dict`. Old names of keys are translated, and removed keys are left
         out.
@@ -43,7 +45,8 @@ def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
     Raises:
       ConfigError: if it is invalid.
     """
-    return build(TrainConfig, modernise(TrainConfig, stored), where)
+    known = modernise(TrainConfig, stored)
+    return build(TrainConfig, {key: known[key] for key in known if key != "extensions"}, where)
 
 
 def read_config(run: Path) -> dict:
@@ -108,7 +111,7 @@ def _inherited(typed: Sequence[str]) -> list[str]:
 
     They set robot, task, realism and the shape of the networks. Typed words override them.
     """
-    source = files.values(files.split_words(TrainConfig, typed)).get("init_from")
+    source = files.parse(TrainConfig, typed).get("init_from")
     if not isinstance(source, str):
         return []
     try:
@@ -170,15 +173,15 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     Raises:
       ConfigError: if another key is given, or a stored or new value is invalid.
     """
-    words = files.split_words(TrainConfig, overrides)
-    for key, word in words.items():
+    words = files.parse(TrainConfig, overrides)
+    for key, value in words.items():
         if key not in _RESUME_KEYS and not key.startswith("run."):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
-                f"{section.show(word, quote='')} cannot be given: resume keeps the rest of "
-                f"the stored run and takes {allowed} only."
+                f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of the "
+                f"stored run and takes {allowed} only."
             )
-    given = files.values(words)
+    given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None} | given.get("run", {})
     spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
@@ -251,6 +254,7 @@ def _go_on_or_begin(
     spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
     if typed.streams is not None and "streams" in given:
         spread["streams"] = typed.streams
+    spread["extensions"] = typed.extensions
     settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
     return settle(settled), False
 

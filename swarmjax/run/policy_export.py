@@ -21,6 +21,7 @@ from swarmjax.training import seeds
 POLICY = "policy.npz"
 
 
+_LOCAL = ("run", "resume", "init_from")
 _TASK = ("control_step", "target_radius", "arrival", "step_limit")
 
 
@@ -100,12 +101,17 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "realism": to_dict(trained.realism),
             "stages": [to_dict(stage) for stage in trained.stage],
             "extensions": trained.pieces,
-            "config": to_dict(trained),
+            "config": _shared(trained),
             "versions": provenance.versions(),
             "update": update,
             "seed": seed,
         }
     )
+
+
+def _shared(trained: TrainConfig) -> dict[str, Any]:
+    """Returns the config without what concerns only the machine of the run, such as its paths."""
+    return {key: value for key, value in to_dict(trained).items() if key not in _LOCAL}
 
 
 def _own_network(algo: AlgoConfig) -> dict[str, str]:

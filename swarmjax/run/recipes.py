@@ -1,6 +1,8 @@
-"""Recipes: files that hold the settings of a whole run, for `recipe=NAME`."""
+"""Recipes: files that hold the settings of a whole run, for `recipe=NAME`.
 
-import json
+Recipes are made to be passed on, so they are data: `TrainConfig.shared` lists what they may set.
+"""
+
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,10 +27,10 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
       ConfigError: if there is no such recipe, or its file is invalid.
     """
     others = [word for word in typed if not word.startswith("recipe=")]
-    chosen = [files.choice_of(word) for word in typed if word.startswith("recipe=")]
-    if not chosen or chosen[-1] in ("", "null"):
+    chosen = files.parse(cls, [word for word in typed if word.startswith("recipe=")]).get("recipe")
+    if not chosen:
         return others
-    path, chain = files.named_path("recipes", chosen[-1], "recipe"), list[Path]()
+    path, chain = files.named_path("recipes", chosen, "recipe"), list[Path]()
     words = others
     while path is not None:
         own, base = _read(cls, path)
@@ -47,9 +49,11 @@ def _read(cls: type[Section], path: Path) -> tuple[list[str], Path | None]:
     """Returns the own words of a recipe, and the file of the recipe that it extends."""
     found = files.read_yaml(path)
     base = found.pop("recipe", None)
-    words = list(_words(found))
+    files.check_shared(cls, found, path)
+    choices, values = files.of_file(found, path.parent)
+    words = [*_words(choices), *_words(values)]
     try:
-        files.split_words(cls, words)
+        files.parse(cls, words)
         return words, _base(path, base)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
@@ -73,4 +77,4 @@ def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:
         if isinstance(value, Mapping):
             yield from _words(value, f"{where}{key}.")
         else:
-            yield f"{where}{key}={value if isinstance(value, str) else json.dumps(value)}"
+            yield f"{where}{key}={files.write(value)}"

@@ -119,6 +119,23 @@ class TrainConfig(ProgramConfig):
 
     command: ClassVar[str] = "train"
     renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
+    # What is trained. Which code runs, where it is written, what it starts from and who is called
+    # is decided by whoever starts the run.
+    shared: ClassVar[tuple[str, ...]] = (
+        "stage",
+        "robot",
+        "task",
+        "realism",
+        "algo",
+        "curriculum",
+        "sim",
+        "arenas",
+        "budget",
+        "levels_per_rollout",
+        "seed",
+        "seeds",
+        "streams",
+    )
 
     # `recipes.expand` replaces this word by the recipe's words, so no config holds it.
     recipe: str | None = field(

@@ -76,11 +76,11 @@ def load_levels[C: Section](
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         _check_suite_alone(cls, mapping.get("suite"), overrides)
-        words = files.split_words(cls, overrides)
+        words = files.parse(cls, overrides)
         if stage is None or "stage" in words:
             return mapping | {"stage": pick_one(mapping.get("stage", {}), chosen["stage"])}
-        mine = {key: word for key, word in words.items() if key.startswith("stage.")}
-        given = files.values(mine).get("stage", {})
+        mine = {key: value for key, value in words.items() if key.startswith("stage.")}
+        given = files.nest(mine).get("stage", {})
         return mapping | {"stage": complete({**stage, **given})}
 
     return files.load(cls, overrides, fill_in)
@@ -90,7 +90,7 @@ def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[st
     """Refuses keys that the suite's file sets itself."""
     if suite is None:
         return
-    for key in files.split_words(cls, overrides):
+    for key in files.parse(cls, overrides):
         if key.partition(".")[0] in ("stage", "shape", "episodes", "seed"):
             raise ConfigError(
                 f"{key} cannot be given with suite={called(str(suite))}, which sets its own "

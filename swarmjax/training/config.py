@@ -82,7 +82,8 @@ class ProgramConfig(Section):
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
     extensions: str | None = field(
-        default=None, metadata=about("Python file with your own extension; it is executed")
+        default=None,
+        metadata=about("Python file with your own extension; it is executed", stored=False),
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,

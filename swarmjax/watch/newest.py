@@ -57,7 +57,7 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
     from swarmjax.run.policy_export import write_policy
 
     run = Path(settings.run)
-    trained = _settled(settings, rows.read_config(run))
+    trained = settle(replace(rows.read_config(run), extensions=settings.extensions))
     seed, stage = _seed(settings, trained), _stage(trained, history)
     leaves, update, _ = checkpoint.restore(run)
     name = f"update-{update}.npz"
@@ -77,16 +77,6 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
         f"{words.count(update, 'update')}."
     )
     return Newest(update, sentence, page)
-
-
-def _settled(settings: WatchConfig, trained: TrainConfig) -> TrainConfig:
-    """Replaces the run's extension file by the one in the page's settings."""
-    if trained.extensions is not None and settings.extensions is None:
-        raise ConfigError(
-            "the run was trained with an extension, which is code: to see its policy, give "
-            "extensions=FILE, a file that you trust."
-        )
-    return settle(replace(trained, extensions=settings.extensions))
 
 
 def _seed(settings: WatchConfig, trained: TrainConfig) -> int:

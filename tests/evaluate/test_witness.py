@@ -62,7 +62,7 @@ def test_policies_of_both_rules_are_not_compared_until_told(tmp_path: Path) -> N
         _policy(path, f"task.arrival={path.stem}")
     words = [f"compare={paths[0]},{paths[1]}"]
     sentence = refusal(_load, *words)
-    assert "were trained differently, with task.arrival its default and 'hold':" in sentence
+    assert "were trained differently, with task.arrival its default and hold:" in sentence
     assert _load(*words, "task.arrival=hold").task.arrival == "hold"
 
 

@@ -43,7 +43,7 @@ def test_resume_refuses_other_keys(word):
     stored = to_dict(load_train([]))
     assert refusal(load_resume, stored, [word]) == (
         f"{word} cannot be given: resume keeps the rest of the stored run and takes budget, "
-        "devices, resume, run.*, streams only."
+        "devices, resume, run.*, streams, extensions only."
     )
 
 
@@ -51,5 +51,7 @@ def test_resume_checks_keys_and_values():
     stored = to_dict(load_train([]))
     assert refusal(load_resume, stored, ["budgt=3"]) == ("budgt is not a key: did you mean budget?")
     assert refusal(load_resume, stored, ["run.dry=3"]) == "run.dry is 3: give true or false."
-    assert refusal(load_resume, stored, ["budget=[1"]).startswith("'budget=[1' cannot be read: ")
+    assert refusal(load_resume, stored, ["budget=[1"]).startswith(
+        "budget is '[1', which cannot be read: "
+    )
     assert refusal(load_resume, stored | {"arenas": 3}, []).startswith("stored arenas is 3, but ")

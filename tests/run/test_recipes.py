@@ -14,7 +14,7 @@ def own(tmp_path: Path) -> Path:
     """A user's recipe."""
     path = tmp_path / "mine.yaml"
     path.write_text(
-        "stage: s3\nrun:\n  dir: null\nalgo:\n  hidden_sizes: [32, 16]\n  memory: gru\n"
+        "stage: s3\nalgo:\n  hidden_sizes: [32, 16]\n  memory: gru\n"
         "  memory_size: null\nrobot: wheeled\nrealism:\n  speed_noise: 0.1\n"
     )
     return path
@@ -115,4 +115,4 @@ def test_an_unknown_key_names_the_file(own: Path) -> None:
 def test_a_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     said = refusal(load_run, ["recipe=worlds", f"resume={tmp_path}"])
-    assert said.startswith("recipe='worlds' cannot be given: resume keeps the rest")
+    assert said.startswith("recipe=worlds cannot be given: resume keeps the rest")

@@ -16,6 +16,7 @@ from runs import CONFIG, row, write
 
 from swarmjax import command
 from swarmjax.config import ConfigError
+from swarmjax.config.section import ByName
 from swarmjax.run import directory
 from swarmjax.run.directory import Writer
 from swarmjax.watch import __main__ as watch
@@ -277,10 +278,16 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     mark = tmp_path / "ran"
     own = tmp_path / "own.py"
     own.write_text(f"open({str(mark)!r}, 'w')\n")
-    run = write(tmp_path / "run", [row(0)], trained=replace(CONFIG, extensions=str(own)))
+    pieces = ByName({"reward": ByName({"mine": "0" * 64})})
+    run = write(tmp_path / "run", [row(0)], trained=replace(CONFIG, pieces=pieces))
+    stored = json.loads((run / "config.json").read_text()) | {"extensions": str(own)}
+    (run / "config.json").write_text(json.dumps(stored))
     views = Views(WatchConfig(run=str(run)))
     views.draw()
-    with pytest.raises(ConfigError, match=r"^the run was trained with an extension, which is code"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^the stored run .* the reward mine,",
+    ):
         newest.record(views.settings, views.drawn.history)
     assert not mark.exists()
 
