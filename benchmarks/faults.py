@@ -24,6 +24,7 @@ from benchmarks import (
     faults_nan,
     faults_policies,
     faults_runs,
+    faults_shared,
     key_value,
 )
 from swarmjax import command, provenance
@@ -57,6 +58,7 @@ CAMPAIGNS: dict[str, Campaign] = {
     "nan": Campaign(faults_nan.trial, 240),
     "policies": Campaign(faults_policies.trial, 1000),
     "inputs": Campaign(faults_inputs.trial, 5000),
+    "shared": Campaign(faults_shared.trial, 2000),
     "hosts": Campaign(faults_hosts.trial, 10),
 }
 

@@ -47,7 +47,11 @@ _PROCESS_MEMORY = 2**34  # bytes of address space; JAX reserves more than it use
 _PROCESS_SECONDS = 180.0  # s; limit for a separate process, on a machine that does other work
 _EVERY = 10  # one of this many trials starts a separate process
 _ROOT = Path(__file__).resolve().parents[1]
-_PYTHONPATH = os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])
+_ENVIRONMENT = {
+    "PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")]),
+    "PYTHONDONTWRITEBYTECODE": "1",
+    "JAX_PLATFORMS": "cpu",
+}
 Words = Sequence[str]
 
 
@@ -194,12 +198,17 @@ def _spoil(name: str, draw: random.Random) -> None:
         return
     text = path.read_text()
     for _ in range(draw.choice((1, 1, 2, 5))):
-        text = _mutate_text(text, draw)
+        text = mutate_text(text, draw)
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
 
 
-def _mutate_text(text: str, draw: random.Random) -> str:
-    """Changes a YAML or JSON text: a few letters, a line, a value, or the whole text."""
+def mutate_text(text: str, draw: random.Random) -> str:
+    """Changes a YAML or JSON text: a few letters, a line, a value, or the whole text.
+
+    Args:
+      text: the text of a file.
+      draw: random source of the change.
+    """
     lines = text.splitlines(keepends=True) or [""]
     at, line = draw.randrange(len(text) + 1), draw.randrange(len(lines))
     bomb = "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 20))
@@ -290,8 +299,17 @@ def _limited(folder: Path) -> Iterator[None]:
         os.chdir(place)
 
 
-def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Makes the settings of a command in this process; returns the outcome and the message."""
+def in_process(name: str, words: Words, folder: Path) -> tuple[str, str]:
+    """Does the first part of a command in this process.
+
+    Args:
+      name: name of the command.
+      words: its words.
+      folder: folder of the files that the words name.
+
+    Returns:
+      The outcome and the message.
+    """
     try:
         with _limited(folder):
             LOADERS[name][0](words)
@@ -309,14 +327,22 @@ def _in_process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
         return "TRACEBACK", repr(error)
 
 
-def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
-    """Runs a command in a separate process; returns the outcome and the message."""
-    typed = [_kept_in(word) for word in words]
+def process(name: str, command: Words, folder: Path) -> tuple[str, str]:
+    """Runs a command in a separate process.
+
+    Args:
+      name: name of the command.
+      command: what follows the interpreter, with the words.
+      folder: folder of the files that the words name.
+
+    Returns:
+      The outcome and the message.
+    """
     try:
         done = subprocess.run(
-            [sys.executable, "-m", f"swarmjax.{name}", *typed, *_TINY[name]],
+            [sys.executable, *command],
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": _PYTHONPATH, "JAX_PLATFORMS": "cpu"},
+            env=os.environ | _ENVIRONMENT,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=_PROCESS_SECONDS,
@@ -336,7 +362,7 @@ def _process(name: str, words: list[str], folder: Path) -> tuple[str, str]:
     return "refused", said
 
 
-def _spent() -> float:
+def spent() -> float:
     """Returns the processor time of this process and of its finished children, s."""
     both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in both)
@@ -370,15 +396,20 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
     with contextlib.chdir(folder):
         _write_files(draw)
     is_process = seed % _EVERY == 0
-    began, before = time.perf_counter(), _spent()
-    outcome, said = (_process if is_process else _in_process)(name, words, folder)
-    spent = _spent() - before
+    began, before = time.perf_counter(), spent()
+    if is_process:
+        typed = [_kept_in(word) for word in words]
+        command = ["-m", f"swarmjax.{name}", *typed, *_TINY[name]]
+        outcome, said = process(name, command, folder)
+    else:
+        outcome, said = in_process(name, words, folder)
+    used = spent() - before
     return {
-        "outcome": "SLOW" if outcome == "refused" and spent > MOST_SECONDS else outcome,
+        "outcome": "SLOW" if outcome == "refused" and used > MOST_SECONDS else outcome,
         "command": name,
         "how": "process" if is_process else "in process",
         "words": [ascii(word[:100]) for word in words],
         "said": ascii(said[-300:]),
-        "processor_s": round(spent, 3),
+        "processor_s": round(used, 3),
         "seconds": round(time.perf_counter() - began, 3),
     }

@@ -187,7 +187,7 @@ def _encrypt(content: bytes, draw: random.Random) -> bytes:
 
 def _say(content: bytes, draw: random.Random) -> bytes:
     """Changes the file's metadata, and writes a correct or an incorrect digest."""
-    arrays = _arrays(content)
+    arrays = arrays_of(content)
     said = json.loads(str(arrays["meta"]))
     key = draw.choice(sorted(said))
     said[key] = draw.choice((None, 10**400, -1, 1e39, [], {}, "\0", [[]] * 9, {"a": {}}, "x" * 999))
@@ -207,7 +207,7 @@ def _say(content: bytes, draw: random.Random) -> bytes:
 
 
 def _foreign_digest(content: bytes, draw: random.Random) -> bytes:
-    arrays = _arrays(content)
+    arrays = arrays_of(content)
     wrong = draw.choice(("0" * 64, "", "x" * 10**6, hashlib.sha256(b"other").hexdigest()))
     arrays["digest"] = draw.choice((np.array(wrong), np.zeros(3), np.array([wrong])))
     return _savez(arrays)
@@ -215,7 +215,7 @@ def _foreign_digest(content: bytes, draw: random.Random) -> bytes:
 
 def _other_array(content: bytes, draw: random.Random) -> bytes:
     """Replaces an array with another array, and mostly corrects the digest."""
-    arrays = _arrays(content)
+    arrays = arrays_of(content)
     name = draw.choice(sorted(arrays.keys() - {"digest", "meta"}))
     array = arrays[name]
     arrays[name] = draw.choice(
@@ -224,7 +224,8 @@ def _other_array(content: bytes, draw: random.Random) -> bytes:
     return _with_digest(arrays, draw)
 
 
-def _arrays(content: bytes) -> dict[str, np.ndarray]:
+def arrays_of(content: bytes) -> dict[str, np.ndarray]:
+    """Returns the arrays in the content of a policy file, by name."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         return dict(archive)
 
@@ -237,7 +238,7 @@ def _savez(arrays: dict[str, np.ndarray]) -> bytes:
 
 def _with_digest(arrays: dict[str, np.ndarray], draw: random.Random) -> bytes:
     rest = {name: array for name, array in arrays.items() if name != "digest"}
-    digest = _digest(rest) if draw.random() < 0.9 else "0" * 64
+    digest = digest_of(rest) if draw.random() < 0.9 else "0" * 64
     return _savez(rest | {"digest": np.array(digest)})
 
 
@@ -261,7 +262,7 @@ DAMAGE: dict[str, Callable[[bytes, random.Random], bytes]] = {
 # Outcomes
 
 
-def _digest(arrays: dict[str, np.ndarray]) -> str:
+def digest_of(arrays: dict[str, np.ndarray]) -> str:
     """Computes the digest exactly as docs/policy-format.md describes."""
     found = b""
     for name in sorted(arrays):
@@ -272,8 +273,8 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 
 def _is_right(path: Path) -> bool:
     """Tells whether the digest in a file matches its arrays, as NumPy reads them."""
-    arrays = _arrays(path.read_bytes())
-    return str(arrays.pop("digest")) == _digest(arrays)
+    arrays = arrays_of(path.read_bytes())
+    return str(arrays.pop("digest")) == digest_of(arrays)
 
 
 def is_sentence(text: str) -> bool:

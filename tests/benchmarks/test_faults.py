@@ -1,12 +1,15 @@
 """Checks that campaigns of faults resume where they stopped, and count the outcomes of trials."""
 
+import contextlib
 import json
+import os
+import socket
 from pathlib import Path
 
 import pytest
 from sentences import refusal
 
-from benchmarks import faults, faults_inputs, faults_policies
+from benchmarks import faults, faults_inputs, faults_policies, faults_shared
 from benchmarks.faults import Campaign
 
 
@@ -80,3 +83,24 @@ def test_fuzzed_inputs_run_or_are_refused(tmp_path: Path) -> None:
             folder.mkdir()
             found.append(faults_inputs.trial(seed, folder))
     assert {row["outcome"] for row in found} <= {"refused", "runs"}, found
+
+
+def test_files_from_strangers_do_nothing_but_describe(tmp_path: Path) -> None:
+    found = []
+    for seed in range(1, 40):  # trial 0 would start a process
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        found.append(faults_shared.trial(seed, folder))
+    assert {row["outcome"] for row in found} <= {"refused", "runs"}, found
+
+
+def test_the_watch_sees_what_a_file_must_not_do(tmp_path: Path) -> None:
+    evil = tmp_path / "evil.py"
+    evil.write_text("")
+    with contextlib.chdir(tmp_path), faults_shared.watched(tmp_path) as seen:
+        exec(compile("", str(evil), "exec"))
+        Path("elsewhere").touch()
+        Path("out").mkdir()  # allowed
+        os.environ.get("SWARMJAX_SECRET")
+        socket.getaddrinfo("127.0.0.1", 9)
+    assert [line.split()[1] for line in seen] == ["IMPORT", "WRITE", "ENVIRONMENT", "SOCKET"]

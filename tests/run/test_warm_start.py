@@ -381,7 +381,7 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
         (
             ["init_from=a", "resume={}"],
             "init_from=a cannot be given: resume keeps the rest of the stored run and takes "
-            "budget, devices, resume, run.*, streams only.",
+            "budget, devices, resume, run.*, streams, extensions only.",
         ),
         (
             ["init_from_std=reset"],
