@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import dispatch, exploration, losses, networks, normalizer, optimizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
@@ -40,8 +41,8 @@ class LearnerState:
       optimizer_state: State of the optimiser that `init` made.
       normalizer: Moments of the valid observations of all updates so far. A learner that does not
         normalise keeps the initial moments.
-      explored: [], int32, control steps that the schedule of exploration has counted; None if
-        exploration is learned.
+      explored: [], int32, control steps that the schedule of exploration has counted, at most
+        2^31 - 1; None if exploration is learned.
     """
 
     params: Params
@@ -125,7 +126,8 @@ def explore(learner: LearnerState, config: AlgoConfig, steps: jax.Array | int) -
     """
     if learner.explored is None:
         return learner
-    explored = learner.explored + steps
+    # The count stays at its largest value, since a run may go on from another one's count.
+    explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
     std = exploration.scheduled_std(config, explored - 1)
     return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
 

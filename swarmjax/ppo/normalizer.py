@@ -26,11 +26,14 @@ class Normalizer:
         negligible.
       mean: [O].
       variance: [O], of the population; 1 before the first observation.
+      rest: [2, O], what rounding to float32 has taken from mean and variance. After a million
+        updates, a batch moves them by less than float32 can hold.
     """
 
     count: jax.Array
     mean: jax.Array
     variance: jax.Array
+    rest: jax.Array
 
     @property
     def std(self) -> jax.Array:
@@ -44,6 +47,7 @@ def init(observation_size: int) -> Normalizer:
         count=jnp.zeros((), jnp.float32),
         mean=jnp.zeros((observation_size,), jnp.float32),
         variance=jnp.ones((observation_size,), jnp.float32),
+        rest=jnp.zeros((2, observation_size), jnp.float32),
     )
 
 
@@ -77,11 +81,27 @@ def update(
     count = normalizer.count + batch_count
     share = batch_count / jnp.maximum(count, 1.0)
     shift = batch_mean - normalizer.mean
+    spread = batch_variance + (1.0 - share) * shift**2
+    mean, mean_rest = _add(normalizer.mean, share * shift + normalizer.rest[0])
+    variance, variance_rest = _add(
+        normalizer.variance, share * (spread - normalizer.variance) + normalizer.rest[1]
+    )
     return Normalizer(
         count=count,
-        mean=normalizer.mean + share * shift,
-        variance=(1.0 - share) * (normalizer.variance + share * shift**2) + share * batch_variance,
+        mean=mean,
+        variance=jnp.maximum(variance, 0.0),  # rounding may leave less
+        rest=jnp.stack([mean_rest, variance_rest]),
     )
+
+
+def _add(total: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Adds two numbers; also returns what rounding takes from the sum.
+
+    Together, both are exact: Knuth, "The Art of Computer Programming" 2, section 4.2.2, theorem B.
+    """
+    found = total + change
+    taken = found - total
+    return found, (total - (found - taken)) + (change - taken)
 
 
 def normalize(normalizer: Normalizer, observation: jax.Array, limit: float) -> jax.Array:

@@ -53,6 +53,15 @@ def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
     np.testing.assert_allclose(_std(begun), [0.6, 0.6], rtol=1e-6)
 
 
+def test_the_count_of_steps_does_not_wrap() -> None:
+    state = learner.init(jax.random.key(0), SCHEDULED, 3, 2, 5)
+    state = replace(state, explored=jnp.int32(2**31 - 50))
+    for _ in range(2):
+        state = learner.explore(state, SCHEDULED, 100)
+        assert state.explored == 2**31 - 1
+        np.testing.assert_allclose(_std(state), [0.1, 0.1], rtol=1e-6)  # float32, as above
+
+
 def test_without_a_schedule_a_learner_stays_as_it_is() -> None:
     learned = AlgoConfig(hidden_sizes=(8,), num_minibatches=1)
     state = learner.init(jax.random.key(0), learned, 3, 2, 5)

@@ -48,11 +48,44 @@ def test_small_deviations_on_a_large_offset_keep_their_variance() -> None:
     np.testing.assert_allclose(state.variance, [0.5 / 3.0], rtol=1e-6)
 
 
+def test_rounding_does_not_add_up() -> None:
+    def exact(count: float, mean: float, variance: float) -> tuple[float, float]:
+        """Merges the same batch again and again, in float64, with the formula of two sets."""
+        for _ in range(updates):
+            count += 4.0
+            share = 4.0 / count
+            variance = (1 - share) * (variance + share * (5.0 - mean) ** 2) + share * 1.25
+            mean += share * (5.0 - mean)
+        return mean, variance
+
+    updates, past = 100_000, 4e7  # ten million batches of four before
+    batch = jnp.array([[3.5], [4.5], [5.5], [6.5]])  # mean 5, variance 1.25
+    begun = normalizer.Normalizer(
+        count=jnp.float32(past),
+        mean=jnp.array([4.0]),
+        variance=jnp.array([9.0]),
+        rest=jnp.zeros((2, 1)),
+    )
+
+    @jax.jit
+    def ended() -> normalizer.Normalizer:
+        def step(state: normalizer.Normalizer, _: None) -> tuple[normalizer.Normalizer, None]:
+            return normalizer.update(state, batch, jnp.ones(4, bool)), None
+
+        return jax.lax.scan(step, begun, length=updates)[0]
+
+    mean, variance = exact(past, 4.0, 9.0)
+    # Half a unit in the last place of float32, 2^-24, of 4 and of 9.
+    np.testing.assert_allclose(ended().mean, [mean], rtol=1e-6)
+    np.testing.assert_allclose(ended().variance, [variance], rtol=1e-6)
+
+
 def test_normalize_is_shift_scale_and_clip() -> None:
     state = normalizer.Normalizer(
         count=np.float32(9.0),
         mean=np.array([1.0, 0.0, 5.0], np.float32),
         variance=np.array([4.0, 0.25, 0.0], np.float32),
+        rest=np.zeros((2, 3), np.float32),
     )
     observation = np.array([[3.0, -9.0, 5.0], [0.0, 0.5, 5.001]], np.float32)
     # Column 3 has variance 0, so it is divided by the smallest allowed deviation, 0.001.
