@@ -1,6 +1,8 @@
 """Tests the policy file: a written policy reads back, and what is unsound is refused by name."""
 
+import contextlib
 import io
+import itertools
 import json
 import os
 import pickle
@@ -15,12 +17,16 @@ import pytest
 from policies import Arrays, forge, saved, several
 
 from swarmjax import command, policy, policy_file
+from swarmjax.config import ConfigError
 from swarmjax.evaluate import __main__ as evaluate_command
+from swarmjax.evaluate import witness
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.policy import MAX_BYTES, PolicyError
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.policy_export import policy_meta
 from swarmjax.task.observation import SIZE
 
 
@@ -665,3 +671,60 @@ def test_commands_refuse_damaged_files_with_exit_code_2(
         assert said.err.startswith(f"swarmjax.{name}: error: {path}")
         assert said.err.count("\n") == 1
     assert [found.name for found in tmp_path.iterdir()] == ["policy.npz"]
+
+
+# The parts of `meta` that commands read beside what `policy_file` has always checked.
+_READ = ("robot", "sensors", "task", "realism", "stages", "action", "observation")
+
+
+def _places(found: Any) -> Iterator[tuple[Any, Any]]:
+    """Yields each place of nested plain data: a list or mapping, and a key of it."""
+    for key in list(found) if isinstance(found, dict) else range(len(found)):
+        yield found, key
+        if isinstance(found[key], dict | list):
+            yield from _places(found[key])
+
+
+@pytest.mark.parametrize("value", ["x", [1, 2], {}, None, -1, 10**400, float("nan")], ids=repr)
+def test_any_field_of_a_signed_file_may_hold_anything(tmp_path: Path, value: Any) -> None:
+    path, arrays = tmp_path / "policy.npz", policies.arrays()
+    trained = {"format": 2, **policy_meta(load_train(["stage=s1"]), update=1, seed=0)}
+    places = [_places(part) for name, part in trained.items() if name in _READ]
+    for where, key in itertools.chain(*places):
+        before, where[key] = where[key], value
+        forge(path, arrays, trained)
+        where[key] = before
+        with contextlib.suppress(PolicyError, ConfigError):  # the only two errors that are allowed
+            witness.load(EvaluateConfig, [f"policy={path}"])
+            export.convert(ExportConfig(policy=str(path), format="c"), path, tmp_path / "out")
+
+
+def _filled(name: str, value: float) -> Arrays:
+    arrays = policies.arrays()
+    return arrays | {f"actor/{name}": np.full_like(arrays[f"actor/{name}"], value)}
+
+
+@pytest.mark.parametrize("name", ["hidden_0/kernel", "hidden_1/kernel", "mean/kernel"])
+def test_weights_that_overflow_float32_are_refused(tmp_path: Path, name: str) -> None:
+    forge(tmp_path / "policy.npz", _filled(name, 3e38), _said())
+    layer = name.removesuffix("/kernel")
+    with pytest.raises(PolicyError, match=rf"policy\.npz: actor/{layer} has weights up to 3e\+38"):
+        policy_file.read(tmp_path / "policy.npz")
+
+
+def test_the_bound_of_a_sum_is_worked_out_layer_by_layer(tmp_path: Path) -> None:
+    # Ten inputs of at most 10, weights of w: 100 w in each of four units. With relu, three units
+    # of weights 1e18 and then three of 1e17 follow: 4e2 w 1e18, and 1.2e20 w 1e17. With w = 1 this
+    # is 1.2e38, plus biases, which are small. With w = 3 it is 3.6e38, more than 3.4e38.
+    layers = {"hidden_0/kernel": 1.0, "hidden_1/kernel": 1e18, "mean/kernel": 1e17}
+    arrays = policies.arrays()
+    for name, value in layers.items():
+        arrays[f"actor/{name}"] = np.full_like(arrays[f"actor/{name}"], value)
+    forge(tmp_path / "policy.npz", arrays, _said(activation="relu"))
+    policy_file.read(tmp_path / "policy.npz")
+    arrays["actor/hidden_0/kernel"] *= 3
+    forge(tmp_path / "policy.npz", arrays, _said(activation="relu"))
+    with pytest.raises(PolicyError, match=r"sums could reach 3\.6e\+38"):
+        policy_file.read(tmp_path / "policy.npz")
+    forge(tmp_path / "policy.npz", arrays, _said(activation="tanh"))
+    policy_file.read(tmp_path / "policy.npz")

@@ -48,6 +48,8 @@ _PRIOR_SUCCESS = 0.5
 # arXiv:2106.14876): the difference of a fast and a slow mean, in both directions. The two rates
 # are this project's choice.
 _SLOWNESS = 0.2
+# A figure that was not measured. It is not NaN, because JAX_DEBUG_NANS looks for NaN.
+UNKNOWN = -math.inf
 
 
 class Schedule(NamedTuple):
@@ -99,7 +101,7 @@ class CohortTally(NamedTuple):
 class Record(NamedTuple):
     """The record of each stage, [S] each.
 
-    Before a stage's first verdict, `episodes` is 0 and all other figures are nan.
+    Before a stage's first verdict, `episodes` is 0 and all other figures are `UNKNOWN`.
 
     Attributes:
       episodes: episodes of the newest verdict, int32.
@@ -121,8 +123,10 @@ class Record(NamedTuple):
 
     @property
     def progress(self) -> Array:
-        """How far the deciding success has recently risen or fallen, [S], at least 0."""
-        return jnp.abs(self.fast - self.slow)
+        """How far the deciding success has recently risen or fallen, [S], at least 0 if known."""
+        known = jnp.isfinite(self.fast)
+        fast, slow = (jnp.where(known, mean, 0.0) for mean in (self.fast, self.slow))
+        return jnp.where(known, jnp.abs(fast - slow), UNKNOWN)
 
 
 @struct.dataclass(kw_only=True)
@@ -160,7 +164,7 @@ class CohortVerdict(NamedTuple):
     Attributes:
       over: [] whether a cohort is over. All episodes of the cohort before it have then ended.
       judged: [S] whether the cohort before had episodes on the stage; all False unless `over`.
-      success: [S] deciding success of each stage's newest verdict; nan before the first.
+      success: [S] deciding success of each stage's newest verdict; `UNKNOWN` before the first.
     """
 
     over: Array
@@ -189,7 +193,7 @@ class Decision(NamedTuple):
       reason: [] one of `REASONS`, int32.
       stage: [] index of the newest stage before the decision, int32.
       next_stage: [] index of the newest stage after the decision, int32.
-      success: [] deciding success of the newest verdict on `stage`; nan before the first.
+      success: [] deciding success of the newest verdict on `stage`; `UNKNOWN` before the first.
     """
 
     reason: Array
@@ -281,7 +285,7 @@ def init(schedule: Schedule, options: CurriculumConfig, mode: Mode) -> Curriculu
       The curriculum before the first update.
     """
     stages = schedule.deadline.shape[0]
-    zero, unknown = jnp.zeros((), jnp.int32), jnp.full(stages, jnp.nan, jnp.float32)
+    zero, unknown = jnp.zeros((), jnp.int32), jnp.full(stages, UNKNOWN, jnp.float32)
     blank = Curriculum(
         stage=zero,
         weights=unknown,
@@ -443,9 +447,9 @@ def _judge(record: Record, tally: CohortTally, judged: Array, options: Curriculu
     def moved(mean: Array, rate: Array) -> Array:
         return mean + rate * (success - mean)
 
-    new = jnp.isnan(record.fast)
+    new = ~jnp.isfinite(record.fast)
     fast = moved(jnp.where(new, _PRIOR_SUCCESS, record.fast), rate)
-    slow = jnp.where(new, fast, moved(record.slow, _SLOWNESS * rate))
+    slow = jnp.where(new, fast, moved(jnp.where(new, fast, record.slow), _SLOWNESS * rate))
     verdict = verdict._replace(fast=fast, slow=slow)
     return jax.tree.map(lambda new, old: jnp.where(judged, new, old), verdict, record)
 

@@ -185,20 +185,20 @@ def _per_robot(weights: Array, robots: Array) -> Array:
 
 def _learnability(record: Record) -> Array:
     return jnp.where(
-        jnp.isnan(record.fast), _UNKNOWN_LEARNABILITY, record.fast * (1.0 - record.fast)
+        jnp.isfinite(record.fast), record.fast * (1.0 - record.fast), _UNKNOWN_LEARNABILITY
     )
 
 
 def _progress(record: Record) -> Array:
     """Returns |fast - slow|; stages without a verdict get the largest value of the other stages."""
-    known = ~jnp.isnan(record.progress)
+    known = jnp.isfinite(record.progress)
     most = jnp.max(jnp.where(known, record.progress, 0.0))
     unknown = jnp.where(jnp.any(known), most, 1.0)
     return jnp.where(known, record.progress, unknown)
 
 
 def _failure(record: Record) -> Array:
-    return 1.0 - jnp.where(jnp.isnan(record.fast), 0.0, record.fast)
+    return 1.0 - jnp.where(jnp.isfinite(record.fast), record.fast, 0.0)
 
 
 _SCORES = {"learnability": _learnability, "progress": _progress, "failure": _failure}

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from swarmjax import command, policy_file
 from swarmjax.config import ConfigError, files
+from swarmjax.evaluate import witness
 from swarmjax.export import c, check, onnx, webots
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
@@ -35,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     settings = files.load(ExportConfig, arguments)
     if settings.policy is not None:
         out = _target(settings, Path(settings.policy).parent)
-        _convert(settings, Path(settings.policy), out)
+        convert(settings, Path(settings.policy), out)
         sys.stdout.write(f"{out}: the policy of {settings.policy}.\n")
         return 0
     run = Path(settings.run or "")
@@ -49,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / POLICY
             write_policy(file, leaves, trained, update, seed)
-            _convert(settings, file, out)
+            convert(settings, file, out)
         sys.stdout.write(f"{out}: the policy of {run} after {update} updates.\n")
     return 0
 
@@ -104,12 +105,23 @@ def _check_controller(out: Path) -> None:
         )
 
 
-def _convert(settings: ExportConfig, source: Path, out: Path) -> None:
-    """Writes a policy file in another form."""
+def convert(settings: ExportConfig, source: Path, out: Path) -> None:
+    """Writes a policy file in another form.
+
+    Args:
+      settings: the form.
+      source: the policy file.
+      out: the file or folder to write.
+
+    Raises:
+      PolicyError: if the policy file is unsound.
+      ConfigError: if the policy does not fit the form, or `out` cannot be written.
+    """
     meta, content = policy_file.read_meta(source), source.read_bytes()
     if settings.format == "npz":
         export_folder.write_file(out, content)
         return
+    witness.trained(meta, str(source))  # refuses numbers that the archive's reader leaves unchecked
     check.expressible(meta, settings.format, settings.sensors)
     trained = policy_file.read(source)
     if settings.format == "onnx":

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from swarmjax.policy import FORMAT, HEARING_FORMAT, MEMORY_FORMAT, PolicyError
+from swarmjax.policy_file.reach import Inputs, check_reach
 
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
@@ -86,6 +87,8 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     actions = _check_action(meta["action"], heard.messages)
     _check_embodiment(meta)
     _check_arrays(arrays, _Sizes(learners, size, recalled, heard, actions), own=own)
+    limit, bounded = float(meta["observation"]["limit"]), meta["activation"] == "tanh"
+    check_reach(arrays, hidden_layers(arrays, own=own), Inputs(limit, heard.robots, bounded))
 
 
 def file_format(meta: Mapping[str, Any]) -> int:

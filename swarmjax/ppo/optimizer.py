@@ -153,12 +153,13 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
 
     Returns:
       The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken
-      but some were skipped, the means are NaN. If none was skipped either, the means are 0.
+      but some were skipped, the means are -inf. If none was skipped either, the means are 0.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
     # Exactly 1 if all steps of the update were taken.
     share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
-    share = jnp.where((taken == 0) & (skipped > 0), jnp.nan, share)
-    means = {name: jnp.mean(metric) * share for name, metric in metrics.items()}
+    # Not NaN: JAX_DEBUG_NANS would take it for a mistake.
+    lost = (taken == 0) & (skipped > 0)
+    means = {n: jnp.where(lost, -jnp.inf, jnp.mean(x) * share) for n, x in metrics.items()}
     del means["taken_steps"]
     return means | {"skipped_steps": skipped}

@@ -22,7 +22,7 @@ from swarmjax.run import hosts, memory, recorder
 from swarmjax.run.checkpoint import Checkpoints, Kept
 from swarmjax.run.directory import EPISODES, METRICS, Row
 from swarmjax.run.display import Display, summarize
-from swarmjax.run.errors import CheckpointError, DivergedError
+from swarmjax.run.errors import CheckpointError, DivergedError, TrainingError
 from swarmjax.run.loggers import Logger
 from swarmjax.run.recorder import Recorder
 from swarmjax.run.settings import TrainConfig
@@ -511,6 +511,13 @@ def _decisions(settings: TrainConfig, rows: list[Row]) -> list[Row]:
 def _watch_steps(settings: TrainConfig, tally: Tally, rows: list[Row]) -> None:
     """Counts the updates in a row that taught nothing, and ends the run after too many."""
     for row in rows:
+        broken, skipped = row["broken_arenas"], row["skipped_steps"]
+        if jax.config.jax_debug_nans and (broken or skipped):
+            raise TrainingError(
+                f"update {row['update'] + 1:,} had numbers that are not finite, in "
+                f"{words.count(broken, 'arena')} and {words.count(int(skipped), 'gradient step')}. "
+                "JAX_DEBUG_NANS is on, so the run stops; look at the functions of extensions first."
+            )
         seed, skipped = row["seed"], row["policy_loss"] is None or _broke(settings, row)
         tally.barren[seed] = tally.barren[seed] + 1 if skipped else 0
         if tally.barren[seed] >= PATIENCE:

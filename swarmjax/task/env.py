@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from swarmjax.config import ConfigError
 from swarmjax.extension import NONE, Extensions, LevelDrawing, RewardTerm
 from swarmjax.sim import dispatch, infrared, model, physics
 from swarmjax.sim import drive as sim_drive
@@ -166,6 +167,11 @@ def load(
     """
     robot, task = robot or RobotConfig(), task or TaskConfig()
     realism, sim = realism or RealismConfig(), make_room(sim or SimConfig(), stages)
+    if jax.config.jax_enable_x64:
+        raise ConfigError(
+            "jax_enable_x64 is on, but arenas and learners compute in 32 bits: switch it off, as "
+            "in JAX_ENABLE_X64=0."
+        )
     chosen = pieces.choose(extensions, task, stages)
     extended.check(chosen, robots=sim.robots, obstacles=sim.obstacles)
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))

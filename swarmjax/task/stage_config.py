@@ -66,10 +66,11 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
 
 def _with_walls(stage: dict[str, Any]) -> dict[str, Any]:
     """Fills in the number of walls of a stage with a layout, unless it is given."""
-    if stage.get("level") not in LAYOUTS or "obstacles" in stage:
+    level = stage.get("level")
+    if not isinstance(level, str) or level not in LAYOUTS or "obstacles" in stage:
         return stage
     cells = section.convert(int | None, stage.get("cells"), "stage.cells")
-    kind = Kind(stage["level"], typing.cast(int | None, cells) or 0, bool(stage.get("breadth")))
+    kind = Kind(level, typing.cast(int | None, cells) or 0, bool(stage.get("breadth")))
     return {**stage, "obstacles": kind.walls}
 
 

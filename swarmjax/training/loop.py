@@ -224,7 +224,7 @@ def _practise(
         source = source._replace(gained=gained)
     played = practice.together(practice.plays(every, ended, loss, config), program.shards)
     fast = curriculum.record.fast
-    usual = jnp.where(jnp.isnan(fast), 0.5, fast)
+    usual = jnp.where(jnp.isfinite(fast), fast, 0.5)
     buffer, taken = levels.update(curriculum.levels, played, config.levels, usual)
     source = source._replace(slot=levels.mark_lost(source.slot, taken))
     arenas = replace(arenas, source=source)

@@ -20,6 +20,7 @@ from swarmjax.curriculum.engine import (
     NEVER,
     REWEIGHED,
     STAYED,
+    UNKNOWN,
     CohortTally,
     Curriculum,
     Decision,
@@ -208,7 +209,7 @@ def test_start(
     assert (int(state.stage), int(state.met)) == (stage, met)
     assert (int(state.cohort), int(state.age), int(state.since)) == (0, 0, 0)
     np.testing.assert_allclose(state.weights, weights, rtol=1e-6)  # rounding of float32
-    assert all(np.isnan(column).all() for column in state.record[1:])
+    assert all((column == UNKNOWN).all() for column in state.record[1:])
     assert not any(np.any(column) for column in (*state.current, *state.previous))
 
 
@@ -352,12 +353,12 @@ def test_record_of_a_cohort(schedule: Schedule) -> None:
     record = state.record
     assert record.episodes.tolist() == [4, 0, 1]
     # Rounding of float32 throughout.
-    np.testing.assert_allclose(record.success, [6 / 10, np.nan, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(record.complete, [1 / 4, np.nan, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(record.contacts, [5 / 10, np.nan, 0.0], rtol=1e-6)
-    np.testing.assert_allclose(record.reward, [1.5 / 10, np.nan, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(record.success, [6 / 10, UNKNOWN, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(record.complete, [1 / 4, UNKNOWN, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(record.contacts, [5 / 10, UNKNOWN, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(record.reward, [1.5 / 10, UNKNOWN, 0.0], rtol=1e-6)
     # Both means begin at 1/2 with the weight of 20 trials, and 10 and 5 trials are added.
-    fast = [0.5 + 10 / 30 * (0.6 - 0.5), np.nan, 0.5 + 5 / 25 * (1.0 - 0.5)]
+    fast = [0.5 + 10 / 30 * (0.6 - 0.5), UNKNOWN, 0.5 + 5 / 25 * (1.0 - 0.5)]
     for mean in (record.fast, record.slow):
         np.testing.assert_allclose(mean, fast, rtol=1e-6)
 
@@ -396,7 +397,7 @@ def test_a_stage_without_episodes_keeps_its_record(schedule: Schedule) -> None:
     seen = [[Episode(NOW, 10, 5), Episode(NOW, 10, 2, stage=1)], [], [Episode(NOW, 10, 7)]]
     state, _ = _run(_late(schedule), seen + [[]] * 3)
     # Rounding of float32.
-    np.testing.assert_allclose(state.record.success, [0.7, 0.2, np.nan], rtol=1e-6)
+    np.testing.assert_allclose(state.record.success, [0.7, 0.2, UNKNOWN], rtol=1e-6)
 
 
 # --- when mode `sequential` decides
@@ -408,7 +409,7 @@ def test_no_decision_before_two_step_limits(schedule: Schedule) -> None:
     assert [row.reason for row in rows] == [STAYED, STAYED, STAYED, BY_THRESHOLD]
     assert [row.stage for row in rows] == [0, 0, 0, 1]
     assert [row.cohort for row in rows] == [0, 1, 1, 2]
-    assert [math.isnan(row.success) for row in rows] == [True, True, True, False]
+    assert [row.success == UNKNOWN for row in rows] == [True, True, True, False]
     assert rows[3].success == 1.0
     assert [row.judged for row in rows] == [0, 0, 0, 0]
 
@@ -460,7 +461,7 @@ def test_short_episodes_weigh_no_more_than_long_ones(schedule: Schedule) -> None
 def test_a_cohort_without_episodes_decides_nothing(schedule: Schedule) -> None:
     _, rows = _run(_late(schedule), [[]] * 8)
     assert {row.reason for row in rows} == {STAYED}
-    assert all(math.isnan(row.success) for row in rows)
+    assert all(row.success == UNKNOWN for row in rows)
     assert [row.cohort for row in rows] == [0, 1, 1, 2, 2, 3, 3, 4]
 
 
@@ -470,14 +471,14 @@ def test_episodes_of_the_stage_that_was_left_decide_no_more(schedule: Schedule) 
     old = [Episode(0, stage=0), Episode(1, stage=0)]
     state, rows = _run(_late(schedule), [PERFECT] * 4 + [old, old])
     assert rows[3].stage == 1
-    assert math.isnan(rows[5].success)
+    assert rows[5].success == UNKNOWN
     assert state.record.success.tolist()[0] == 1.0  # the old stage keeps its record
     # The new stage is judged only after two step limits, and only by its own episodes.
     new = [*old, Episode(NOW, 10, 3)]
     _, rows = _run(_late(schedule), [PERFECT] * 4 + [new] * 4)
     assert [row.reason for row in rows[4:]] == [STAYED] * 4
     assert [row.judged for row in rows[4:]] == [1] * 4
-    assert all(math.isnan(row.success) for row in rows[4:7])
+    assert all(row.success == UNKNOWN for row in rows[4:7])
     assert rows[7].success == np.float32(6 / 20)
 
 
@@ -487,7 +488,7 @@ def test_deadline(schedule: Schedule) -> None:
     expected = [BY_BUDGET if update in (4, 9) else STAYED for update in range(12)]
     assert [row.reason for row in rows] == expected
     assert [row.stage for row in rows] == [0] * 4 + [1] * 5 + [2] * 3
-    assert math.isnan(rows[4].success)
+    assert rows[4].success == UNKNOWN
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,9 @@ def _learners(*drives: tuple) -> LearnerState:
         "log_std": arrays["actor/log_std"],
     }
     mean, std = arrays["normalizer/mean"], arrays["normalizer/std"]
-    seen = Normalizer(count=jnp.ones(len(drives)), mean=mean, variance=std**2)
+    seen = Normalizer(
+        count=jnp.ones(len(drives)), mean=mean, variance=std**2, rest=jnp.zeros((len(drives), 2, 1))
+    )
     return LearnerState(params={"actor": actor}, optimizer_state=(), normalizer=seen)
 
 

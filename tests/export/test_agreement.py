@@ -44,6 +44,7 @@ def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.nda
             count=jnp.ones(()),
             mean=mine["normalizer/mean"],
             variance=mine["normalizer/std"] ** 2,
+            rest=jnp.zeros((2, 1)),
         )
         features = normalizer.normalize(moments, observation, 10.0)
         return networks.action_distribution({"actor": actor}, config, features)[0]
@@ -120,6 +121,7 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
             count=jnp.ones(()),
             mean=mine["normalizer/mean"],
             variance=mine["normalizer/std"] ** 2,
+            rest=jnp.zeros((2, 1)),
         )
         features = normalizer.normalize(moments, observation, 10.0)
         none = jnp.zeros(MEMORY)
@@ -230,7 +232,9 @@ def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.nda
             actor["memory"] = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
             none = jnp.zeros(MEMORY)
         mean, std = (mine[f"normalizer/{name}"] for name in ("mean", "std"))
-        moments = normalizer.Normalizer(count=jnp.ones(()), mean=mean, variance=std**2)
+        moments = normalizer.Normalizer(
+            count=jnp.ones(()), mean=mean, variance=std**2, rest=jnp.zeros((2, 1))
+        )
         features = normalizer.normalize(moments, observation, 10.0)
         began = None if none is None else begins
         return networks.recall_action({"actor": actor}, config, features, none, began)[0]
