@@ -205,6 +205,20 @@ def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
         swarmjax.load_policy(result.run / "policy.npz")
 
 
+@pytest.mark.parametrize("call", [swarmjax.make_env, lambda: swarmjax.train_policy(["stage=s1"])])
+def test_64_bits_are_refused_in_one_sentence(
+    call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with jax.enable_x64(True), pytest.raises(swarmjax.SwarmjaxError) as caught:
+        call()
+    assert str(caught.value) == (
+        "jax_enable_x64 is on, but arenas and learners compute in 32 bits: switch it off, as in "
+        "JAX_ENABLE_X64=0."
+    )
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [

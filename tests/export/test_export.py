@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import policies
 import pytest
 from policies import saved, saved_for_webots
@@ -19,10 +20,17 @@ from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
 from swarmjax.run.load_settings import load_train, read_config
-from swarmjax.run.policy_export import policy_meta
+from swarmjax.run.policy_export import policy_arrays, policy_meta
 from swarmjax.run.settings import TrainConfig
 
 FORMATS = {"npz": "policy.npz", "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
+
+
+def test_a_deviation_in_the_file_is_at_least_the_smallest_one() -> None:
+    learners = "learners/normalizer"
+    leaves = {f"{learners}/mean": np.zeros((1, 2)), f"{learners}/variance": np.array([[4.0, 0.0]])}
+    # An observation that never varied would otherwise be divided by 0.
+    np.testing.assert_array_equal(policy_arrays(leaves)["normalizer/std"], [[2.0, 0.001]])
 
 
 def _refusal(

@@ -518,6 +518,19 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     assert checkpoint.restore(tmp_path)[1] == 4
 
 
+def test_a_search_for_nan_ends_the_run_at_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body = "@reward_term(weight=1.0)\ndef broken(step):\n    return jnp.nan * step.action[:, 0]\n"
+    mine = extensions.write(tmp_path / "mine.py", body)
+    words = [*TINY, f"extensions={mine}", f"run.dir={tmp_path / 'run'}"]
+    with jax.debug_nans(True):
+        assert train.main(words) == FAILED
+    said = capsys.readouterr().err
+    assert "update 1 had numbers that are not finite, in " in said
+    assert "JAX_DEBUG_NANS is on, so the run stops; look at the functions of extensions" in said
+
+
 @pytest.mark.slow
 def test_a_run_whose_arenas_all_break_stops_and_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

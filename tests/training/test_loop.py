@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.env import World
 from swarmjax.task.stage_config import StageConfig
-from swarmjax.training import loop
+from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
@@ -80,6 +81,37 @@ def test_a_run_trains_and_reports_one_row_an_update(
     # 8 arenas of two robots run for 8 control steps; robots that arrive early add fewer.
     assert 0 < metrics["transitions"][0] <= 8 * 2 * 8
     assert set(np.asarray(metrics["broken_arenas"][:5])) == {0}
+
+
+def test_levels_noise_and_shuffles_are_drawn_by_keys_of_their_own(
+    program: Program, start: Callable[[], TrainState], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = []
+
+    def taken(*arguments: Any, **_: Any) -> Any:
+        """Keeps the key, which is the last argument of each of the three."""
+        keys.append(tuple(jax.random.key_data(arguments[-1]).tolist()))
+        if len(keys) == 3:
+            raise StopIteration
+        return None, None, None
+
+    monkeypatch.setattr(loop, "_draw_waiting", taken)
+    monkeypatch.setattr(rollout, "collect", taken)
+    monkeypatch.setattr(rollout, "batch", lambda *_: None)
+    monkeypatch.setattr(loop, "_learn", taken)
+    state = start()
+    with pytest.raises(StopIteration):
+        loop.update(program, programs.schedule(program.config), state)
+    keys.append(tuple(jax.random.key_data(state.key).tolist()))
+    assert len(set(keys)) == 4
+
+
+def test_neither_state_nor_metrics_hold_nan(
+    program: Program, start: Callable[[], TrainState], chunk: Chunk
+) -> None:
+    state, metrics = chunk(programs.schedule(program.config), start(), np.int32(1))
+    for leaf in jax.tree.leaves((to_leaves(start()), to_leaves(state), metrics)):
+        assert not np.isnan(leaf).any()  # JAX_DEBUG_NANS would stop the run
 
 
 def test_stage_numbers_are_no_part_of_the_program(
