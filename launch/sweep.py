@@ -216,5 +216,6 @@ def main(arguments: Sequence[str]) -> int:
 
 if __name__ == "__main__":
     for number in (signal.SIGTERM, signal.SIGHUP):  # like Ctrl-C, they cancel the jobs
-        signal.signal(number, signal.default_int_handler)
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.default_int_handler)
     sys.exit(command.run("sweep", main, SweepConfig))

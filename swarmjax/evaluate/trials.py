@@ -296,7 +296,8 @@ def work_each[Job, Result](
 def _begin_worker() -> None:
     """Prepares a process that judges."""
     # Ctrl-C ends the process at once and silently; its parent prints the message.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     # Extensions run on JAX. On a GPU, each process would reserve most of the GPU's memory.
     os.environ["JAX_PLATFORMS"] = "cpu"
     threading.Thread(target=_end_with_parent, daemon=True).start()

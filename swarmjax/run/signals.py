@@ -2,7 +2,8 @@
 
 SIGINT comes from a person and ends the run with code 130. SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP come
 from a scheduler or a lost terminal. They end the run with code 75, so that a job script can requeue
-it. This module imports nothing slow, so a command can listen before it loads JAX.
+it. A signal that is ignored when the command starts stays ignored. This module imports nothing
+slow, so a command can listen before it loads JAX.
 """
 
 import contextlib
@@ -68,7 +69,9 @@ class Stop:
         """Begins to listen."""
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        self._before = {number: signal.signal(number, self._ask) for number in CODES}
+        # `nohup`, or `&` in a script, has signals ignored. They stay ignored.
+        heard = [each for each in CODES if signal.getsignal(each) is not signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._ask) for number in heard}
         self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         self._thread = threading.Thread(
             target=_watch, args=(self._read, self._patient), daemon=True

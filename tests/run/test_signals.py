@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 
 import pytest
 
@@ -28,9 +29,15 @@ sys.exit(stop.code)
 """
 
 
-def _start(how: str) -> subprocess.Popen:
+def _start(how: str, ignored: Sequence[int] = ()) -> subprocess.Popen:
     code = [sys.executable, "-c", _PROCESS, how]
-    process = subprocess.Popen(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        code,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: [signal.signal(number, signal.SIG_IGN) for number in ignored],
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "listening\n"
     return process
@@ -52,6 +59,19 @@ def test_a_signal_asks_to_stop_and_says_so(number: int, code: int) -> None:
     _, said = process.communicate(timeout=30)
     assert process.returncode == code
     assert said == "stopping after the current call, to save; a second signal stops at once\n"
+
+
+@pytest.mark.parametrize("ignored", [signal.SIGHUP, signal.SIGINT])
+def test_a_signal_that_is_ignored_at_the_start_stays_ignored(ignored: int) -> None:
+    process = _start("poll", [ignored])
+    process.send_signal(ignored)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.3)
+    process.send_signal(signal.SIGUSR1)  # the first signal that counts
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == REQUEUE
+    assert said.count("stopping after the current call") == 1
+    assert "stopped at once" not in said
 
 
 def test_a_second_signal_ends_the_process_even_within_a_call() -> None:
