@@ -31,7 +31,7 @@ import numpy as np
 
 import swarmjax
 from benchmarks import key_value
-from swarmjax import atomic_file, command, provenance
+from swarmjax import command, outputs, provenance
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate import cells, statistics, trials
@@ -147,7 +147,7 @@ def judge(config: ScalingConfig) -> Iterator[dict[str, Any]]:
         places = {point: judged_file(config, point, cell.name, action) for point in trained}
         left = {point: files for point, files in trained.items() if not places[point].exists()}
         for point, found in _try(replace(settings, action=action), left, cell).items():
-            with atomic_file.replacing(places[point]) as temporary:
+            with outputs.replacing(places[point]) as temporary:
                 np.savez(temporary, allow_pickle=False, **found)
             means = {name: round(float(x.mean()), 5) for name, x in found.items()}
             yield {"point": str(point), "cell": cell.name, "action": action, **means}

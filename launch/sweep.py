@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from swarmjax import command, words
+from swarmjax import command, outputs, words
 from swarmjax.config import ConfigError, Section, about, build, section
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
 from swarmjax.policy import PolicyError
@@ -202,12 +202,14 @@ def main(arguments: Sequence[str]) -> int:
     settings, cells = parse(arguments)
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
+    outputs.check("dir", [folder / "sweep.json"], overwrite=False)
     left = [cell for cell in cells if not cell.is_done]
     _say(f"{words.count(len(cells), 'cell')}, {len(cells) - len(left)} of them done before")
     codes = dict.fromkeys((cell.label for cell in cells), 0) | work(left, settings)
     lines = table.read_each({cell.run: cell.label for cell in cells})
     found = {"words": list(arguments), "codes": codes, "cells": table.plain(lines)}
     directory.write_json(folder / "sweep.json", found)
+    outputs.note([folder / "sweep.json"])
     if lines:
         _say(table.text(lines))
     failed = [label for label, code in codes.items() if code not in (0, REQUEUE)]

@@ -1,14 +1,16 @@
 """Handles `--help` and the user's errors (one sentence, exit code 2) for all commands."""
 
+import contextlib
 import inspect
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TextIO
 
 from swarmjax.config import ConfigError, files, reading, section
 from swarmjax.config.section import Section
-from swarmjax.exit_codes import INTERRUPTED, USER_ERROR
+from swarmjax.exit_codes import FAILED, INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
 
 HELP = {"-h", "--help"}
@@ -95,6 +97,16 @@ def run(
     Returns:
       The exit code: 2 for the user's errors, which are printed in one sentence.
     """
+    with outputs_kept(_module(name)) as ended:
+        return ended(_run(name, main, settings, also))
+
+
+def _run(
+    name: str,
+    main: Callable[[Sequence[str]], int],
+    settings: type,
+    also: tuple[type[Exception], ...],
+) -> int:
     arguments = sys.argv[1:]
     module = _module(name)
     try:
@@ -115,6 +127,70 @@ def run(
         name, reason = reading.called(str(error.filename)), error.strerror
         sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
         return USER_ERROR
+
+
+class _Stream:
+    """Standard output or error, which may lose its reader or have no room.
+
+    Attributes:
+      error: why it could not be written; None if it could.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """Takes a stream; None if it was closed before the command began."""
+        self._stream = stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+        self.error: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Writes text, or drops it."""
+        self._try(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Writes what is buffered, or drops it."""
+        self._try(self._stream.flush)
+
+    def _try(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError as error:
+            self.error = self.error or error
+            # Python flushes the stream again at exit. This must not fail again.
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+    def __getattr__(self, name: str) -> Any:
+        """Behaves otherwise like the stream itself."""
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def outputs_kept(module: str) -> Iterator[Callable[[int], int]]:
+    """Lets a command finish its work although nobody reads its output, in a `with` block.
+
+    Args:
+      module: name of the command in messages.
+
+    Yields:
+      A function that takes the command's exit code, and returns the one to end with: 1 instead of
+      0 if standard output had no room.
+    """
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = out, err = _Stream(sys.stdout), _Stream(sys.stderr)
+
+    def ended(code: int) -> int:
+        out.flush()
+        if out.error is None or isinstance(out.error, BrokenPipeError):
+            return code
+        err.write(f"{module}: error: standard output cannot be written: {out.error.strerror}.\n")
+        return code or FAILED
+
+    try:
+        yield ended
+    finally:
+        out.flush()
+        err.flush()
+        sys.stdout, sys.stderr = before
 
 
 def line(name: str, *arguments: str) -> str:

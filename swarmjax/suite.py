@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from swarmjax import command
-from swarmjax.atomic_file import replacing
+from swarmjax import command, outputs
 from swarmjax.config import ConfigError, about, files, reading
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
@@ -32,6 +31,7 @@ from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.evaluate.trials import Entrant, Trial
+from swarmjax.outputs import OVERWRITE, replacing
 
 _WIDTH = 100  # columns of a suite's file
 
@@ -44,6 +44,7 @@ class SuiteConfig(Section):
 
     suite: str = field(metadata=about("a name in configs/suites/, or a .yaml file"))
     out: str | None = field(default=None, metadata=about(".npz file for all of its levels"))
+    overwrite: bool = field(default=False, metadata=OVERWRITE)
     write: bool = field(
         default=False,
         metadata=about("write digests, and chosen episodes, into the suite's file"),
@@ -93,9 +94,12 @@ def main(arguments: Sequence[str]) -> int:
         )
     if settings.out is not None and Path(settings.out).suffix != ".npz":
         raise ConfigError(f"out is {reading.called(settings.out)}: give a file .npz.")
+    out = [] if settings.out is None else [Path(settings.out)]
+    outputs.check("out", out, overwrite=settings.overwrite)
     suite = _renew(settings) if settings.write else cells.draw(settings.suite)
-    if settings.out is not None:
-        cells.write(Path(settings.out), suite)
+    for path in out:
+        cells.write(path, suite)
+    outputs.note(out)
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH

@@ -2,11 +2,14 @@
 
 import json
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 import pytest
+from runs import row, write
 
 from swarmjax import command
 from swarmjax.config import ConfigError, files, section, to_dict
@@ -89,3 +92,40 @@ def test_a_topic_that_does_not_exist_is_refused() -> None:
         ConfigError, match=r"^--help algos is not a topic: give a key, or one of .*all"
     ):
         command.help_text(TrainConfig, "swarmjax.train", ["algos"])
+
+
+def _shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Runs a line of bash, in which $RUN stands for `python -m swarmjax`."""
+    run = shlex.join([sys.executable, "-m", "swarmjax"])
+    return subprocess.run(
+        ["bash", "-c", line.replace("$RUN", run)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "error"),
+    [
+        ("$RUN.report --help all | true; exit ${PIPESTATUS[0]}", 0, ""),
+        ("$RUN.report --help all >&-", 0, ""),
+        ("$RUN.report --help all >/dev/full", 1, "swarmjax.report: error: standard output cannot"),
+        ("$RUN.report run=run | true; exit ${PIPESTATUS[0]}", 0, ""),
+        ("$RUN.report run=run >&-", 0, ""),
+        ("$RUN.report run=run >/dev/full", 1, "swarmjax.report: error: standard output cannot be"),
+        ("$RUN.report rum=run 2>&-", 2, ""),
+        ("$RUN.report rum=run 2>/dev/full", 2, ""),
+        ("$RUN.report rum=run >&- 2>&-", 2, ""),
+    ],
+)
+def test_a_command_does_its_work_although_nobody_reads(
+    tmp_path: Path, line: str, code: int, error: str
+) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    done = _shell(line, tmp_path)
+    assert done.returncode == code
+    assert done.stderr.startswith(error)
+    assert done.stderr.count("\n") == bool(error)
+    assert (run / "report" / "report.html").exists() == ("run=run" in line)

@@ -9,7 +9,7 @@ import swarmjax
 
 ROOT = Path(swarmjax.__file__).parent
 # `SHARED` holds what many rooms import. `ROOMS` lists all imports allowed to each room.
-SHARED = {"config", "epuck", "extension", "policy", "policy_file", "atomic_file"}
+SHARED = {"config", "epuck", "extension", "policy", "policy_file", "outputs"}
 SHARED |= {"provenance", "command", "exit_codes", "words"}
 ROOMS = {
     "config": set(),
@@ -20,9 +20,9 @@ ROOMS = {
     "training": SHARED | {"sim", "task", "ppo", "curriculum", "shards"},
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
     "evaluate": SHARED | {"sim", "task"},
-    "export": SHARED | {"sim", "run"},
-    "pages": {"config"},
-    "policy_file": {"config", "policy", "policy_network", "extension", "atomic_file"},
+    "export": SHARED | {"sim", "run", "evaluate"},
+    "pages": {"config", "outputs"},
+    "policy_file": {"config", "policy", "policy_network", "extension", "outputs"},
     "replay": SHARED | {"sim", "task", "evaluate", "export", "pages"},
     "report": SHARED | {"task", "run", "evaluate", "pages"},
     "adapters": {"environment"},
@@ -41,7 +41,7 @@ ALONE: dict[str, set[str]] = {
     "extension": {"config"},
     "policy": set(),
     "epuck": set(),
-    "atomic_file": set(),
+    "outputs": {"config"},
     "provenance": {"words"},
     "words": set(),
     "shards": set(),

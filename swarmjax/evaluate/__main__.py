@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from swarmjax import command
+from swarmjax import command, outputs
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import table as evaluate_table
 from swarmjax.evaluate import unfinished, witness
@@ -24,6 +24,9 @@ from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.evaluate.trials import specialise
 from swarmjax.exit_codes import INTERRUPTED
 
+# The files in the folder of a result; two policies that are compared have no plots.
+_NAMES = ("result.json", "levels.csv", "measures.png", "times.png")
+
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
@@ -31,6 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     out = None if settings.out is None else Path(settings.out)
     keep = None if out is None else unfinished.place(out)
     if out is not None:
+        outputs.check("out", _files(out), overwrite=settings.overwrite)
         _check_out(out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
@@ -43,6 +47,7 @@ def main(arguments: Sequence[str]) -> int:
     if out is not None and keep is not None:
         limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
         _write(out, found, max(limits) * settings.task.control_step)
+        outputs.note(path for path in _files(out) if path.exists())
         unfinished.remove(keep)
     console = Console()
     if not console.is_terminal:
@@ -71,6 +76,11 @@ def _left(keep: Path | None) -> str:
         return "nothing was written"
     are = "1 cell is" if done == 1 else f"{done} cells are"
     return f"{are} in {keep}, and the same command continues with the rest"
+
+
+def _files(out: Path) -> list[Path]:
+    """Lists the files that `_write` may write."""
+    return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
 def _check_out(path: Path) -> None:

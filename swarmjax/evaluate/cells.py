@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import epuck, extension, policy
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, build, reading, section, show, to_dict
 from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
 from swarmjax.extension import LevelDrawing
+from swarmjax.outputs import replacing
 from swarmjax.task import level, shapes
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.outputs import OVERWRITE
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -83,6 +84,7 @@ class EvaluateConfig(Section):
         default=None,
         metadata=about("folder for result.json, levels.csv and plots, or a single .json file"),
     )
+    overwrite: bool = field(default=False, metadata=OVERWRITE)
 
     @property
     def step_limit(self) -> int:

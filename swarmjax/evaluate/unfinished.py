@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from swarmjax import provenance
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial, specialise
+from swarmjax.outputs import replacing
 
 _NAME = "unfinished"
 _ABOUT = "evaluation.json"

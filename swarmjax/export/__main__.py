@@ -9,11 +9,11 @@ A run with several seeds gives `policy-seed0.npz` and so on; `seed` exports only
 import re
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from swarmjax import command, policy_file
+from swarmjax import command, outputs, policy_file
 from swarmjax.config import ConfigError, files
 from swarmjax.evaluate import witness
 from swarmjax.export import c, check, onnx, webots
@@ -36,6 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     settings = files.load(ExportConfig, arguments)
     if settings.policy is not None:
         out = _target(settings, Path(settings.policy).parent)
+        _check_free(settings, [out])
         convert(settings, Path(settings.policy), out)
         sys.stdout.write(f"{out}: the policy of {settings.policy}.\n")
         return 0
@@ -43,6 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     trained = from_stored(read_config(run))
     trained = settle(replace(trained, extensions=settings.extensions))
     targets = _targets(settings, trained)
+    _check_free(settings, targets.values())
     leaves, update, skipped = checkpoint.restore(run, settings.step)
     for sentence in skipped:
         sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
@@ -81,6 +83,15 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
     if settings.format == "webots":
         _check_controller(out)
     return out
+
+
+def _check_free(settings: ExportConfig, paths: Iterable[Path]) -> None:
+    """Refuses to replace files of other origin; `export_folder` checks folders.
+
+    A run's own policy is replaced, which training has written.
+    """
+    if settings.format == "onnx" or (settings.format == "npz" and settings.out is not None):
+        outputs.check("out", paths, overwrite=settings.overwrite)
 
 
 def _default(settings: ExportConfig) -> str:

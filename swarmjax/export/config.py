@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.outputs import OVERWRITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +36,7 @@ class ExportConfig(Section):
             "file or folder to write; null: in run or beside policy, named by format and step"
         ),
     )
+    overwrite: bool = field(default=False, metadata=OVERWRITE)
     extensions: str | None = field(
         default=None,
         metadata=about("Python file with the pieces that the policy needs; it is executed"),

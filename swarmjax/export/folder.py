@@ -12,8 +12,9 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from swarmjax.atomic_file import replacing
+from swarmjax import outputs
 from swarmjax.config import ConfigError, reading
+from swarmjax.outputs import replacing
 
 MANIFEST = "export.json"
 BUILT = ("__pycache__", "build")  # made by using an export; may be replaced
@@ -32,6 +33,7 @@ def write_file(path: Path, content: bytes) -> None:
     try:
         with replacing(path) as temporary:
             temporary.write_bytes(content)
+        outputs.note([path])
     except OSError as error:
         raise _unwritable(path, error) from None
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import jinja2
 
+from swarmjax import outputs
 from swarmjax.config import ConfigError
 
 STYLE = "pages/page.css"
@@ -85,23 +86,27 @@ def _hash_source(text: str) -> str:
     return f"'sha256-{_base64(hashlib.sha256(text.encode()).digest())}'"
 
 
-def write(out: Path, files: Mapping[str, bytes]) -> list[Path]:
+def write(out: Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> list[Path]:
     """Writes files into a directory and creates the directory.
 
     Args:
       out: the directory.
       files: contents by name; a name may contain subfolders.
+      overwrite: whether files that this function did not write are replaced.
 
     Returns:
       The paths of the files, in order.
 
     Raises:
-      ConfigError: if a file cannot be written.
+      ConfigError: if a file cannot be written, or must not be replaced.
     """
+    paths = [out / name for name in files]
+    outputs.check("out", paths, overwrite=overwrite)
     try:
         for name, content in files.items():
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             (out / name).write_bytes(content)
+        outputs.note(paths)
     except OSError as error:
         raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
-    return [out / name for name in files]
+    return paths

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from swarmjax import extension, policy
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
 from swarmjax.config.reading import parse_json
+from swarmjax.outputs import replacing
 from swarmjax.policy import FORMAT, MAX_BYTES, MAX_ENTRIES, MAX_LETTERS, Policy, PolicyError
 from swarmjax.policy_file.fields import NETWORK, check, file_format, hidden_layers, short_json
 from swarmjax.policy_network import PolicyNetwork

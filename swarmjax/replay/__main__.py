@@ -15,7 +15,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from swarmjax import command
+from swarmjax import command, outputs
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate import witness
@@ -33,9 +33,10 @@ def main(arguments: Sequence[str]) -> int:
     settings, said = witness.load(ReplayConfig, arguments)
     entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
     out, video = Path(settings.out), settings.video and Path(settings.video)
-    _check_out(out, [*settings.policies, settings.suite, settings.video])
+    others = [*settings.policies, settings.suite, settings.video]
+    _check_out(out, others, overwrite=settings.overwrite)
     if video:
-        _check_video(video, [*settings.policies, settings.suite])
+        _check_video(video, [*settings.policies, settings.suite], overwrite=settings.overwrite)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     words = shlex.join(["python", "-m", "swarmjax.replay", *arguments])
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str]) -> int:
             bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
             report = partial(progress.advance, bar)
             _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
+            outputs.note([video])
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
         missing = _left_out(settings, each)
@@ -74,8 +76,9 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
     return ", ".join(name for name, weight in earning.extra.items() if weight and name not in found)
 
 
-def _check_file(key: str, path: Path) -> None:
+def _check_file(key: str, path: Path, *, overwrite: bool) -> None:
     """Makes the folder of a file before the replay is computed, so that no result is lost."""
+    outputs.check(key, [path], overwrite=overwrite)
     _write(key, path, lambda: path.parent.mkdir(parents=True, exist_ok=True))
     if path.is_dir():
         raise _unwritable(key, path, "it is a folder")
@@ -83,12 +86,12 @@ def _check_file(key: str, path: Path) -> None:
         raise _unwritable(key, path, "permission denied")
 
 
-def _check_out(path: Path, others: Sequence[str | None]) -> None:
+def _check_out(path: Path, others: Sequence[str | None], *, overwrite: bool) -> None:
     """Checks that the page can be written and does not overwrite one of the other files."""
     if path.suffix != ".html":
         raise ConfigError(f"out is {path}: give a name that ends with .html.")
     _check_apart("out", path, others)
-    _check_file("out", path)
+    _check_file("out", path, overwrite=overwrite)
 
 
 def _check_apart(key: str, path: Path, others: Sequence[str | None]) -> None:
@@ -98,12 +101,12 @@ def _check_apart(key: str, path: Path, others: Sequence[str | None]) -> None:
             raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
 
 
-def _check_video(path: Path, others: Sequence[str | None]) -> None:
+def _check_video(path: Path, others: Sequence[str | None], *, overwrite: bool) -> None:
     """Checks that the video can be made and written, and overwrites none of the other files."""
     if path.suffix != ".mp4":
         raise ConfigError(f"video is {path}: give a name that ends with .mp4.")
     _check_apart("video", path, others)
-    _check_file("video", path)
+    _check_file("video", path, overwrite=overwrite)
     replay_video.check()
 
 

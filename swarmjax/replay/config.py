@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import AS_TRAINED, MOST_EPISODES, MOST_STEPS, STEPS, EvaluateConfig
+from swarmjax.outputs import OVERWRITE
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -75,6 +76,7 @@ class ReplayConfig(Section):
     )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
+    overwrite: bool = field(default=False, metadata=OVERWRITE)
     video_speed: float = field(
         default=1.0,
         metadata=about("seconds of the episode per second of video", 0.05, 100.0),

@@ -17,8 +17,8 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
+from swarmjax.outputs import replacing
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Recording, ReplayEpisode

@@ -26,7 +26,9 @@ from swarmjax.report.config import ReportConfig
 PAGE, TABLE = "report.html", "report.json"
 
 
-def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Path]:
+def write(
+    run: Path, out: Path, made_by: str, *, send: bool = False, overwrite: bool = False
+) -> list[Path]:
     """Writes the report of a run.
 
     Args:
@@ -34,6 +36,7 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
       out: directory of the report; it is created.
       made_by: the command that makes the report, for the page.
       send: whether the run's loggers also get the figures and the pages in the run directory.
+      overwrite: whether files of other origin are replaced.
 
     Returns:
       The files.
@@ -54,20 +57,22 @@ def write(run: Path, out: Path, made_by: str, *, send: bool = False) -> list[Pat
     if pictures is not None:
         figures["practised"] = drawing.png(pictures)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
-    written = builder.write(
-        out, {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
-    )
+    content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
+    written = builder.write(out, content, overwrite=overwrite)
     report_send.send(history, [*written, *sorted(run.glob("*.html"))], loggers)
     return written
 
 
-def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> list[Path]:
+def write_table(
+    lines: Sequence[table.TableLine], out: Path, made_by: str, *, overwrite: bool = False
+) -> list[Path]:
     """Writes the table of several runs.
 
     Args:
       lines: the lines of the table.
       out: directory of the report; it is created.
       made_by: the command that makes the table, for the page.
+      overwrite: whether files of other origin are replaced.
 
     Returns:
       The files.
@@ -77,7 +82,8 @@ def write_table(lines: Sequence[table.TableLine], out: Path, made_by: str) -> li
     """
     page = report_page.table_page("Runs", made_by, lines)
     found = json.dumps(table.plain(lines), indent=2) + "\n"
-    return builder.write(out, {TABLE: found.encode(), PAGE: page.encode()})
+    content = {TABLE: found.encode(), PAGE: page.encode()}
+    return builder.write(out, content, overwrite=overwrite)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -88,12 +94,12 @@ def main(arguments: Sequence[str]) -> int:
         lines = table.read(table.find(settings.runs))
         sys.stdout.write(f"{table.text(lines)}\n")
         if settings.out:
-            written = write_table(lines, Path(settings.out), made_by)
+            written = write_table(lines, Path(settings.out), made_by, overwrite=settings.overwrite)
             sys.stdout.write(f"{written[-1]}: the same table as a page.\n")
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"
-    written = write(run, out, made_by, send=settings.send)
+    written = write(run, out, made_by, send=settings.send, overwrite=settings.overwrite)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0

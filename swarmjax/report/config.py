@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from swarmjax.config import ConfigError, Section, about
+from swarmjax.outputs import OVERWRITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +25,7 @@ class ReportConfig(Section):
         default=None,
         metadata=about("directory; null: <run>/report, or with runs only the printed table"),
     )
+    overwrite: bool = field(default=False, metadata=OVERWRITE)
     send: bool = field(
         default=False,
         metadata=about(

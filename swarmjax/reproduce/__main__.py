@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command, provenance
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError, section, to_dict
 from swarmjax.exit_codes import FAILED
+from swarmjax.outputs import replacing
 from swarmjax.report import rows as report_rows
 from swarmjax.reproduce import arms, judge
 from swarmjax.reproduce import page as reproduce_page
@@ -79,6 +79,8 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
                 f"out is {out}, which holds a reproduction already: give another directory, or "
                 f"resume={out} to go on with it."
             )
+        if out.is_dir() and any(out.iterdir()):
+            raise ConfigError(f"out is {out}, which is not empty: give a new or an empty folder.")
         return given, out
     out = Path(resumed)
     return load_reproduce(arguments, _read(out)), out

@@ -54,7 +54,7 @@ def write(out: Path) -> Path:
     files = {f"{FIGURES}/{name}.png": png for name, png in figures.items()}
     files[VERDICTS] = claims.markdown(verdicts).encode()
     files[PAGE] = _page(data, verdicts, figures, lacks).encode()
-    return builder.write(out, files)[-1]
+    return builder.write(out, files, overwrite=True)[-1]
 
 
 def _page(

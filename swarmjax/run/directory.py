@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import itertools
 import json
 import os
 import secrets
@@ -19,8 +20,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from swarmjax.atomic_file import replacing
 from swarmjax.config import ConfigError
+from swarmjax.outputs import replacing
 from swarmjax.run.errors import CheckpointError
 
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
@@ -40,16 +41,17 @@ def new_id() -> str:
 
 
 @contextlib.contextmanager
-def locked(run: Path) -> Iterator[None]:
+def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
     """Keeps other processes out of a run directory, and makes it if it is missing.
 
     Args:
       run: the directory.
+      claimed: whether `claim` has made it. It is removed if the run then writes nothing.
 
     Raises:
       ConfigError: if another process is writing the directory, or it cannot be written.
     """
-    made = _make(run)
+    made = _make(run) or [run, run.parent] * claimed
     with contextlib.ExitStack() as held:
         while True:
             file = held.enter_context(_open_lock(run))
@@ -62,6 +64,37 @@ def locked(run: Path) -> Iterator[None]:
             yield
         finally:
             _remove_empty(run, made)
+
+
+def claim(folder: Path, name: str) -> Path:
+    """Makes a new directory that no other process gets, even if it asks for the same name.
+
+    Args:
+      folder: its parent, which is made if it is missing.
+      name: its name; if there is one, the name with -2, -3 and so on.
+
+    Raises:
+      OSError: if it cannot be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    while True:
+        with contextlib.suppress(FileExistsError):
+            run = folder / next(names)
+            run.mkdir()
+            return run
+
+
+def visible(run: Path) -> list[str]:
+    """Lists the names in a directory, without locks and temporary files of a start that was killed.
+
+    Args:
+      run: the directory; it need not exist.
+    """
+    try:
+        return sorted(each.name for each in run.iterdir() if not each.name.startswith("."))
+    except OSError:  # missing, or refused later where it is written
+        return []
 
 
 def _open_lock(run: Path) -> IO[str]:

@@ -177,16 +177,6 @@ def working(what: str, console: Console | None = None) -> Iterator[None]:
         yield
 
 
-class _Console(Console):
-    """A console that survives a broken pipe.
-
-    Rich's own console would end the process, and the run with it.
-    """
-
-    def on_broken_pipe(self) -> None:
-        """Continues without a reader."""
-
-
 class Display:
     """Shows the run on a console, in a `with` block.
 
@@ -196,7 +186,7 @@ class Display:
     def __init__(self, updates: int, console: Console | None = None) -> None:
         """Prepares a display for a run of `updates` updates."""
         self._updates = updates
-        self._console = console or _Console()
+        self._console = console or Console()
         self._live = Live(console=self._console, auto_refresh=False)
         self._last_line = -LINE_SECONDS
 

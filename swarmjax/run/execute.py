@@ -1,7 +1,6 @@
 """Runs checked settings and returns an exit code: caches, memory, and the closing lines."""
 
 import math
-import os
 import sys
 from pathlib import Path
 
@@ -69,7 +68,9 @@ def _run(settings: TrainConfig, stop: Stop) -> int:
         with hosts.own_directory(found) as run:
             return _train(run, settings, stop)
     except StoppedError:
-        _tell("stopped before the first update: nothing was trained, and nothing is lost\n")
+        sys.stdout.write(
+            "stopped before the first update: nothing was trained, and nothing is lost\n"
+        )
         return stop.code or INTERRUPTED
 
 
@@ -82,18 +83,8 @@ def _train(run: Path, settings: TrainConfig, stop: Stop) -> int:
         kept = f" What was saved before is in {run}." if can_go_on else ""
         sys.stderr.write(f"swarmjax.train: error: {error}{kept}\n")
         return FAILED
-    _tell(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
+    sys.stdout.write(f"{_success(settings, tally)}\n{_closing(run, settings, tally)}\n")
     return stop.code or 0
-
-
-def _tell(text: str) -> None:
-    """Writes to standard output. Ignores the error if the reader of a pipe is gone."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except OSError:
-        # Python would flush the output again at exit, fail, and exit with code 120.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _success(settings: TrainConfig, tally: Tally) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from swarmjax import extension, provenance, words
-from swarmjax.config import ConfigError, to_dict
+from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.curriculum import engine as curriculum
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.policy import PolicyError
@@ -64,7 +64,7 @@ def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) ->
         longer be written.
       StoppedError: if a stop was requested before there was anything to save.
     """
-    with directory.locked(run):
+    with directory.locked(run, claimed=settings.run.dir is None):
         if hosts.is_first():  # the other processes' folders link to the first one's checkpoints
             check_free(run, settings)
         name = settings.run.id or hosts.share_text(directory.new_id())
@@ -287,7 +287,7 @@ def _first_state(
 
 
 def find_run(settings: TrainConfig) -> Path:
-    """Chooses a run directory that is writable and holds no other run; writes nothing.
+    """Chooses a run directory that is writable and empty, and makes it if it was not named.
 
     Raises:
       ConfigError: if there is no such directory, or if a library that the config needs is missing.
@@ -296,7 +296,10 @@ def find_run(settings: TrainConfig) -> Path:
     every = seeds.numbers(settings)
     seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
     name = f"{datetime.now():%Y%m%d-%H%M%S}-{settings.stage_name}-{seed}"
-    run = Path(settings.run.dir) if settings.run.dir else Path("runs") / name
+    try:
+        run = Path(settings.run.dir) if settings.run.dir else directory.claim(Path("runs"), name)
+    except OSError as error:
+        raise directory.unwritable(Path("runs") / name, error) from None
     check_free(run, settings)
     try:
         there = next(path for path in (run, *run.resolve().parents) if path.exists())
@@ -307,7 +310,7 @@ def find_run(settings: TrainConfig) -> Path:
 
 
 def check_free(run: Path, settings: TrainConfig) -> None:
-    """Refuses a directory that holds a run, unless that run is resumed."""
+    """Refuses a directory that is not empty, unless it holds the run that is resumed."""
     directory.check_regular(run)
     resumed = settings.resume is not None and Path(settings.resume).resolve() == run.resolve()
     if (run / directory.CONFIG).exists() and not resumed:
@@ -319,6 +322,12 @@ def check_free(run: Path, settings: TrainConfig) -> None:
         raise ConfigError(
             f"run.dir is {run}, which holds {checkpoint.FOLDER}/ of a run that has lost its "
             f"{directory.CONFIG}: give another directory, or remove that one."
+        )
+    held = directory.visible(run) if not resumed else []
+    if held:
+        raise ConfigError(
+            f"run.dir is {run}, which holds {reading.called(held[0])}: give a new or an empty "
+            "directory."
         )
 
 

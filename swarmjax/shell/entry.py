@@ -22,16 +22,17 @@ def main() -> int:
       The exit code: 2 for the user's errors. A command ends the process with its own code.
     """
     name, *rest = sys.argv[1:] or ["--help"]
-    try:
-        return _run(name, rest)
-    except ConfigError as error:
-        sys.stderr.write(f"swarmjax: error: {error}\n")
-        return USER_ERROR
+    if name in COMMANDS:
+        return _command(name, rest)
+    with command.outputs_kept("swarmjax") as ended:
+        try:
+            return ended(_run(name, rest))
+        except ConfigError as error:
+            sys.stderr.write(f"swarmjax: error: {error}\n")
+            return USER_ERROR
 
 
 def _run(name: str, rest: Sequence[str]) -> int:
-    if name in COMMANDS:
-        return _command(name, rest)
     if name in command.HELP:
         sys.stdout.write(help_text() + "\n")
     elif name == "--version":

@@ -176,7 +176,7 @@ def test_a_page_whose_writing_breaks_off_is_as_it_was(steer, tmp_path, monkeypat
 
     monkeypatch.setattr("os.fsync", crash)
     with pytest.raises(KeyboardInterrupt):
-        replay.main([f"policy={steer}", *QUICK, f"out={out}"])
+        replay.main([f"policy={steer}", *QUICK, f"out={out}", "overwrite=true"])
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.html": "before"}
 
 

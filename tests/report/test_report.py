@@ -13,6 +13,7 @@ from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.report import __main__ as report
 from swarmjax.report.config import ReportConfig
+from swarmjax.run import directory
 from swarmjax.run.settings import RunConfig
 
 
@@ -27,7 +28,7 @@ def test_a_report_is_written_beside_its_run(
     run = write(tmp_path / "a 'run'", [row(0)])
     assert _run(monkeypatch, f"run={str(run)!r}") == 0
     out = run / "report"
-    assert {path.name for path in out.iterdir()} == {"mix.png", "success.png", "report.html"}
+    assert set(directory.visible(out)) == {"mix.png", "success.png", "report.html"}
     page = (out / "report.html").read_text()
     assert f"<h1>Report of {tmp_path}/a &#39;run&#39;</h1>" in page
     assert "<code>python -m swarmjax.report &#39;run=" in page
@@ -69,7 +70,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             ["run=good", "runs=good"],
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
-        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, send."),
+        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, overwrite, send."),
         (["runs=good,gone"], "runs is 'good,gone', but 'gone' names neither a run nor a "),
         (["runs=g*,none*"], "runs is 'g*,none*', but 'none*' names neither a run nor a "),
         (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),

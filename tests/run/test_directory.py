@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,22 @@ def test_a_run_that_wrote_nothing_leaves_no_directory(tmp_path: Path) -> None:
     with directory.locked(tmp_path / "a" / "b"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_starts_of_the_same_second_get_directories_of_their_own(tmp_path: Path) -> None:
+    def claim(_: int) -> str:
+        return directory.claim(tmp_path / "runs", "now").name
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(claim, range(20)))
+    assert sorted(found) == sorted(["now", *(f"now-{number}" for number in range(2, 21))])
+
+
+def test_a_claimed_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
+    run = directory.claim(tmp_path, "now")
+    with directory.locked(run, claimed=True):
+        pass
+    assert not run.exists()
 
 
 def test_a_directory_that_was_there_stays(tmp_path: Path) -> None:

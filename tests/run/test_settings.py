@@ -310,7 +310,7 @@ def test_train_refuses(words, sentence):
         (["engine=warp"], "engine is 'warp': give c or mjx."),
         (["algo=ppo"], "algo is not a key: give one of policy, compare, stage, robot, task, suite, "
          "shape, realism, action, engine, steps, episodes, seed, workers, substeps, extensions, "
-         "out."),
+         "out, overwrite."),
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):

@@ -18,7 +18,7 @@ from swarmjax.config import build, to_dict
 from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
-from swarmjax.run import checkpoint, lifecycle
+from swarmjax.run import checkpoint, directory, lifecycle
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.directory import LOCK
 from swarmjax.run.load_settings import load_train
@@ -320,7 +320,7 @@ def test_export_gives_all_seeds_or_the_one_that_is_asked_for(
     first = {seed: (several / f"policy-seed{seed}.npz").read_bytes() for seed in (3, 4)}
     assert export.main([f"run={several}", f"out={tmp_path / 'all.npz'}"]) == 0
     assert export.main([f"run={several}", "seed=4", f"out={tmp_path / 'one.npz'}"]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {
+    assert set(directory.visible(tmp_path)) == {
         "all-seed3.npz",
         "all-seed4.npz",
         "one.npz",
@@ -366,6 +366,24 @@ def test_a_run_directory_is_never_written_over(
     sentence = _refusal(capsys, "train", *TINY, f"run.dir={whole}")
     assert "holds a run already" in sentence
     assert (whole / "metrics.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize("words", [[], ["resume=auto"]])
+@pytest.mark.parametrize("name", ["policy.npz", "metrics.jsonl", "notes.txt"])
+def test_a_new_run_wants_an_empty_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, words: list[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    assert _refusal(capsys, "train", *TINY, f"run.dir={tmp_path}", *words).endswith(
+        f"run.dir is {tmp_path}, which holds {name}: give a new or an empty directory.\n"
+    )
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "mine"}
+
+
+def test_what_a_killed_start_leaves_is_no_obstacle(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / ".config.77.tmp.json").touch()
+    lifecycle.check_free(tmp_path, load_train([*TINY, f"run.dir={tmp_path}"]))
 
 
 def test_a_resumed_run_spares_other_runs_and_what_is_spent(
