@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from swarmjax import extension, policy_file
+from swarmjax import command, extension, policy_file
 from swarmjax.config import ConfigError, Section, files, show, to_dict
-from swarmjax.policy import Policy, PolicyError
+from swarmjax.policy import Policy
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 if TYPE_CHECKING:
@@ -55,8 +55,13 @@ def _one_error[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return function(*args, **kwargs)
-        except (ConfigError, PolicyError, CheckpointError, TrainingError) as error:
-            raise SwarmjaxError(str(error)) from None
+        except OSError:  # perhaps of a function that the caller has given
+            raise
+        except Exception as error:
+            found = command.explain(error, (CheckpointError, TrainingError))
+            if found is None:
+                raise
+            raise SwarmjaxError(found[0]) from None
 
     return wrapped
 

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from typing import Any, TextIO
 
 from swarmjax.config import ConfigError, files, reading, section
@@ -14,6 +15,10 @@ from swarmjax.exit_codes import FAILED, INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
 
 HELP = {"-h", "--help"}
+_LOST_WORKER = (
+    "a worker process died before its work was done, perhaps because memory ran out: give fewer, "
+    "as in workers=1."
+)
 _ALL = "all"  # the help topic that lists every key
 # For each command's module: words to type after the module's name, and what they do.
 EXAMPLES: dict[str, dict[str, str]] = {
@@ -117,16 +122,50 @@ def _run(
         return main(arguments)
     except KeyboardInterrupt:
         return INTERRUPTED
-    except (ConfigError, PolicyError, *also) as error:
-        sys.stderr.write(f"{module}: error: {error}\n")
-        return USER_ERROR
-    except OSError as error:
-        if error.filename is None:
+    except Exception as error:
+        found = explain(error, also)
+        if found is None:
             raise
+        sys.stderr.write(f"{module}: error: {found[0]}\n")
+        return found[1]
+
+
+def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[str, int] | None:
+    """Describes an error that the user can mend.
+
+    Args:
+      error: the error.
+      also: types of further errors that the user can fix.
+
+    Returns:
+      One sentence, and the exit code of a command; None for any other error.
+    """
+    if isinstance(error, (ConfigError, PolicyError, *also)):
+        return str(error), USER_ERROR
+    if isinstance(error, BrokenExecutor):
+        return _LOST_WORKER, FAILED
+    if isinstance(error, OSError) and error.filename is not None:
         # A file cannot be read or written, and the command has not handled the error itself.
-        name, reason = reading.called(str(error.filename)), error.strerror
-        sys.stderr.write(f"{module}: error: {name} cannot be used: {reason}.\n")
-        return USER_ERROR
+        name = reading.called(str(error.filename))
+        return f"{name} cannot be used: {error.strerror}.", USER_ERROR
+    if isinstance(error, RuntimeError | AssertionError) and _lacks_platform():
+        named = section.show(os.environ["JAX_PLATFORMS"])
+        return (
+            f"JAX_PLATFORMS is {named}, but JAX finds no such device here: give cpu, or unset it.",
+            USER_ERROR,
+        )
+    return None
+
+
+def _lacks_platform() -> bool:
+    """Returns whether JAX_PLATFORMS names no device of this machine."""
+    if not os.environ.get("JAX_PLATFORMS") or "jax" not in sys.modules:
+        return False
+    try:
+        sys.modules["jax"].devices()
+    except (RuntimeError, AssertionError):
+        return True
+    return False
 
 
 class _Stream:

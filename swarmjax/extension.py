@@ -21,9 +21,11 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from swarmjax.config import ConfigError, reading, show
+from swarmjax.config.foreign_code import explained
 from swarmjax.config.section import ByName
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_LARGEST = 3.4e38  # as in `config.section`: float32 holds nothing beyond
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
 
 
@@ -293,19 +295,12 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
         # Do not use cached bytecode or lines. Both caches may be out of date, since they compare
         # only a file's size and its modification time in whole seconds.
         linecache.cache.pop(str(path), None)
-        exec(compile(content, str(path), "exec"), vars(module))
-    except Exception as error:
+        with explained(f"{path} does not import"):
+            exec(compile(content, str(path), "exec"), vars(module))
+    except BaseException:
         del sys.modules[name]
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path} does not import: {describe(error)}.") from None
+        raise
     return module
-
-
-def describe(error: BaseException) -> str:
-    """Formats an error of a user's code for a message: its type and first line."""
-    text = (str(error).strip() or "no reason given").splitlines()[0].rstrip(".")
-    return f"{type(error).__name__}: {text}"
 
 
 def _pieces(names: Mapping[str, object]) -> list[Piece]:
@@ -339,22 +334,30 @@ def collect(pieces: Iterable[Piece], where: str) -> Extensions:
 
 def _check(piece: Piece, where: str) -> None:
     label = f"{where}: {piece.kind} {piece.name}"
-    if not _NAME.fullmatch(piece.name):
+    if not isinstance(piece.name, str) or not _NAME.fullmatch(piece.name):
         raise ConfigError(
             f"{label} is not a valid name: give 1 to 40 lower-case letters, digits and _, a letter "
             "first."
         )
     if piece.name in piece.taken:
         raise ConfigError(f"{label} is the name of a built-in {piece.kind}: rename it.")
+    for key in ("weight", "offset", "scale"):
+        value = getattr(piece, key, 0.0)
+        if type(value) not in (int, float) or not abs(value) <= _LARGEST:
+            raise ConfigError(f"{label} has {key} {show(value)}: give a number that float32 holds.")
     if isinstance(piece, Observation):
-        if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
-            raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
-        if not piece.scale:
-            raise ConfigError(
-                f"{label} has scale 0, by which values are divided: give another number."
-            )
+        _check_observation(piece, label)
     if isinstance(piece, Network) and not isinstance(piece.function, type):
         raise ConfigError(f"{label} is not a class: decorate a flax.linen.Module.")
+
+
+def _check_observation(piece: Observation, label: str) -> None:
+    if not isinstance(piece.unit, str):
+        raise ConfigError(f"{label} has unit {show(piece.unit)}: give text.")
+    if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
+        raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
+    if not piece.scale:
+        raise ConfigError(f"{label} has scale 0, by which values are divided: give another number.")
 
 
 # Digests

@@ -1,6 +1,7 @@
 """Tests the `--help` texts and the examples of every command."""
 
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -8,12 +9,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import policies
 import pytest
 from runs import row, write
 
 from swarmjax import command
 from swarmjax.config import ConfigError, files, section, to_dict
 from swarmjax.config.section import Section
+from swarmjax.evaluate import __main__ as evaluate
+from swarmjax.evaluate import trials
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
 from swarmjax.replay.config import ReplayConfig
@@ -129,3 +133,29 @@ def test_a_command_does_its_work_although_nobody_reads(
     assert done.stderr.startswith(error)
     assert done.stderr.count("\n") == bool(error)
     assert (run / "report" / "report.html").exists() == ("run=run" in line)
+
+
+@pytest.mark.parametrize("value", ["foo", "cuda"])
+def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, value: str) -> None:
+    done = _shell(f"JAX_PLATFORMS={value} $RUN.train stage=s1 run.dir=run", tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        f"swarmjax.train: error: JAX_PLATFORMS is '{value}', but JAX finds no such device here: "
+        "give cpu, or unset it.\n"
+    )
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_worker_that_was_killed_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policies.saved(tmp_path / "policy.npz")
+    words = [f"policy={tmp_path / 'policy.npz'}", "stage=s1", "episodes=4", "workers=2"]
+    monkeypatch.setattr(sys, "argv", ["evaluate", *words])
+    # A process that is killed before it has begun, as by the kernel when memory runs out.
+    monkeypatch.setattr(trials, "_begin_worker", partial(os._exit, 9))
+    assert command.run("evaluate", evaluate.main, EvaluateConfig) == 1
+    assert capsys.readouterr().err.endswith(
+        "swarmjax.evaluate: error: a worker process died before its work was done, perhaps because "
+        "memory ran out: give fewer, as in workers=1.\n"
+    )

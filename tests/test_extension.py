@@ -9,7 +9,9 @@ from sentences import refusal
 
 from swarmjax import extension
 from swarmjax.extension import Extensions
+from swarmjax.run.load_settings import load_train
 from swarmjax.task import observation, reward, stage_config
+from swarmjax.training import program as programs
 
 TERM = """
 SCALE = 2.0
@@ -151,3 +153,59 @@ def test_only_the_kinds_that_matter_are_asked_for() -> None:
     needs = {"reward": {"turning": "0" * 64}}
     assert extension.check_needs(needs, Extensions(), "p", ["observation"]) is None
     assert refusal(extension.check_needs, needs, Extensions(), "p", ["reward"]).startswith("p was ")
+
+
+MUTE = """
+class Mute(Exception):
+    def __str__(self):
+        raise RuntimeError
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("import sys\nsys.exit()", "SystemExit: no reason given."),
+        ("raise SystemExit('a')", "SystemExit: a."),
+        ("class Own(BaseException): pass\nraise Own('b')", "Own: b."),
+        ("raise GeneratorExit", "GeneratorExit: no reason given."),
+        (f"{MUTE}\nraise Mute", "Mute: no reason given."),
+        ("raise ValueError('\\x1b[31m')", "ValueError: \\x1b[31m."),
+    ],
+)
+def test_whatever_a_file_raises_is_one_sentence(tmp_path: Path, body: str, said: str) -> None:
+    mine = extensions.write(tmp_path / "mine.py", body)
+    assert refusal(extension.load, mine) == f"{mine} does not import: {said}"
+
+
+@pytest.mark.parametrize("code", ["import sys; sys.exit()", "raise Mute", "raise BaseException"])
+def test_whatever_a_piece_raises_is_one_sentence(tmp_path: Path, code: str) -> None:
+    body = f"{MUTE}\n@reward_term(weight=1.0)\ndef mine(step):\n    {code}\n"
+    words = ["stage=s1", f"extensions={extensions.write(tmp_path / 'mine.py', body)}"]
+    config = load_train(words)
+    assert f"{tmp_path / 'mine.py'}: reward mine fails: " in refusal(programs.load_world, config)
+
+
+@pytest.mark.parametrize(
+    ("decorator", "said"),
+    [
+        (
+            "reward_term(weight='a')",
+            "reward mine has weight 'a': give a number that float32 holds.",
+        ),
+        ("reward_term(weight=None)", "reward mine has weight null: give a number that float32"),
+        ("reward_term(weight=True)", "reward mine has weight true: give a number that float32"),
+        ("reward_term(weight=jnp.nan)", "reward mine has weight nan: give a number that float32"),
+        ("reward_term(weight=10**400)", "reward mine has weight 100000000000000000000"),
+        ("reward_term(weight=1.0, name=3)", "reward 3 is not a valid name: give 1 to 40"),
+        ("observation(scale='a')", "observation mine has scale 'a': give a number that float32"),
+        ("observation(offset=jnp.inf)", "observation mine has offset inf: give a number that floa"),
+        ("observation(unit=3)", "observation mine has unit 3: give text."),
+        ("observation(size='a')", "observation mine has size 'a': give 1 to 1000."),
+    ],
+)
+def test_a_number_of_a_wrong_kind_names_the_file(tmp_path: Path, decorator: str, said: str) -> None:
+    mine = extensions.write(
+        tmp_path / "mine.py", f"@{decorator}\ndef mine(x):\n    return x.distance\n"
+    )
+    assert refusal(extension.load, mine).startswith(f"{mine}: {said}")

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 
 from swarmjax.config import ConfigError
-from swarmjax.extension import Network, describe
+from swarmjax.config.foreign_code import explained
+from swarmjax.extension import Network
 from swarmjax.ppo import memory as ppo_memory
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.ppo.memory import Gru, Recall
@@ -476,11 +477,9 @@ def _check_torso(config: AlgoConfig, observation_size: int, whose: str = "") -> 
     """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
     seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
     where = f"network {config.network}{whose}"
-    try:
+    with explained(f"{where} fails"):
         made = config.torso()
         found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
-    except Exception as error:
-        raise ConfigError(f"{where} fails: {describe(error)}.") from None
     other = sorted(set(variables) - {"params"})
     if other:
         raise ConfigError(f"{where} keeps {', '.join(other)}: a network may keep only params.")

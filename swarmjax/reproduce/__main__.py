@@ -105,6 +105,7 @@ def _choose_device(device: str) -> None:
       ConfigError: if there is no such device.
     """
     if device == "auto":
+        jax.devices()  # fails here, before anything is written, if JAX_PLATFORMS is wrong
         return
     jax.config.update("jax_platforms", _PLATFORMS[device])
     try:

@@ -11,7 +11,8 @@ from jax import Array
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError
-from swarmjax.extension import LevelDrawing, Observation, Piece, RewardTerm, describe
+from swarmjax.config.foreign_code import explained
+from swarmjax.extension import LevelDrawing, Observation, Piece, RewardTerm
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import level
 from swarmjax.task.level import Level, Spacing
@@ -124,7 +125,8 @@ def redraw(piece: LevelDrawing, drawn: Level) -> Level:
     Raises:
       ConfigError: the drawing changes obstacle sizes, which are fixed in the compiled model.
     """
-    own = _compiled(piece)(drawn)
+    with explained(f"{label(piece)} fails"):
+        own = _compiled(piece)(drawn)
     found = level.park(Level(*(np.asarray(field) for field in own)), np)
     if not np.array_equal(found.obstacle[:, 3:], drawn.obstacle[:, 3:]):
         raise ConfigError(
@@ -146,7 +148,8 @@ def earn(piece: RewardTerm, steps: Mapping[str, Any]) -> np.ndarray:
     """
     reach = np.full(len(steps["distance"]), steps["sensor_range"], np.float32)
     each = Step(**{**steps, "sensor_range": reach})
-    return np.asarray(jax.jit(jax.vmap(piece.function))(each))
+    with explained(f"{label(piece)} fails"):
+        return np.asarray(jax.jit(jax.vmap(piece.function))(each))
 
 
 @functools.lru_cache(maxsize=16)
@@ -211,10 +214,8 @@ def trace(piece: Piece, *arguments: Any) -> Any:
     Raises:
       ConfigError: the piece raises an exception; the message repeats it in one sentence.
     """
-    try:
+    with explained(f"{label(piece)} fails"):
         return jax.eval_shape(piece.function, *arguments)
-    except Exception as error:
-        raise ConfigError(f"{label(piece)} fails: {describe(error)}.") from None
 
 
 def label(piece: Piece) -> str:

@@ -6,10 +6,14 @@ Host and are refused. Without rebinding it cannot read answers either, since no 
 another origin.
 """
 
+import contextlib
 import json
+import socket
 import sys
+import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 from swarmjax.config import ConfigError
 from swarmjax.watch import page
@@ -22,7 +26,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-_TIMEOUT_S = 10.0  # a connection that is silent for longer is closed
+# A browser's answers take milliseconds. A connection that lasts longer is closed, also if it sends.
+_TIMEOUT_S = 10.0
+_MOST = 32  # connections at once; a browser opens six
 
 
 class Server(ThreadingHTTPServer):
@@ -37,6 +43,7 @@ class Server(ThreadingHTTPServer):
           ConfigError: if the port is not available.
         """
         self.views, self.page = views, page.page(views.run)
+        self._begun: dict[socket.socket, float] = {}
         try:
             super().__init__((ADDRESS, port), Answers)
         except OSError as error:
@@ -44,6 +51,26 @@ class Server(ThreadingHTTPServer):
                 f"port is {port}, which is not available ({error.strerror}): give another, or 0 "
                 "for any free port."
             ) from None
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answers a connection in a thread, or closes it if there are too many."""
+        if len(self._begun) >= _MOST:
+            self.shutdown_request(request)
+            return
+        self._begun[request] = time.monotonic()
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Closes a connection."""
+        self._begun.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Ends connections that last too long. `serve_forever` calls this twice a second."""
+        for request, began in list(self._begun.items()):
+            if time.monotonic() - began > _TIMEOUT_S:
+                with contextlib.suppress(OSError):
+                    request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignores a browser that has closed the connection before it received its answer."""

@@ -60,7 +60,15 @@ def progress(run: Path, seeds: int) -> Progress:
         newest = [json.loads(line) for line in lines[-seeds:]]
         done = min(int(row["update"]) for row in newest) + 1 if len(newest) == seeds else 0
         seconds = newest[-1].get("train_s") if newest else None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ):
         return Progress()
     return Progress(done, seconds if isinstance(seconds, int | float) else None)
 
@@ -74,6 +82,10 @@ def stand(run: Path, trained: TrainConfig) -> Standing:
     """
     if not (run / directory.CONFIG).exists():
         return Standing("silent", f"{run} is gone.")
+    try:
+        directory.check_regular(run)
+    except ConfigError as error:
+        return Standing("silent", str(error))
     found, writer, age = progress(run, trained.seeds), directory.writer(run), _age(run)
     so_far = f"{found.done:,} of {words.count(trained.updates, 'update')}"
     if writer is not None and writer.is_here and directory.is_writing(writer):

@@ -12,7 +12,7 @@ from swarmjax.policy import PolicyError
 from swarmjax.report import page as report_page
 from swarmjax.report import rows
 from swarmjax.report.rows import History
-from swarmjax.run.directory import METRICS
+from swarmjax.run.directory import METRICS, check_regular
 from swarmjax.run.errors import CheckpointError
 from swarmjax.watch import newest
 from swarmjax.watch.config import WatchConfig
@@ -74,6 +74,7 @@ class Views:
           ConfigError: if there is no valid config.
         """
         self.settings, self.run = settings, Path(settings.run)
+        check_regular(self.run)
         self.trained = rows.read_config(self.run)
         self.drawn, self.replayed = DrawnFigures(), Replayed()
         self._asked = -LOOKED_AT_S
@@ -110,6 +111,7 @@ class Views:
             return 0.0
         began = time.perf_counter()
         try:
+            check_regular(self.run)
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
             self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))

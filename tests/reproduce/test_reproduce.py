@@ -96,8 +96,8 @@ def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
     stored = {"settings": {"seeds": 3}}
     (tmp_path / "reproduce.json").write_text(json.dumps(stored))
     assert refusal(reproduce.main, [f"resume={tmp_path}", "budget=1e6"]) == (
-        "budget=1000000 cannot be given: resume keeps the rest of the stored reproduction and takes "
-        "resume, minutes, device, arms, episodes, workers only."
+        "budget=1000000 cannot be given: resume keeps the rest of the stored reproduction and "
+        "takes resume, minutes, device, arms, episodes, workers only."
     )
 
 

@@ -1,11 +1,14 @@
 """Tests the answers of the server of a run's page, and what it reports about the run."""
 
+import contextlib
 import http.client
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +24,7 @@ from swarmjax.run import directory
 from swarmjax.run.directory import Writer
 from swarmjax.watch import __main__ as watch
 from swarmjax.watch import newest, standing
+from swarmjax.watch import server as watch_server
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.server import Server
 from swarmjax.watch.standing import stand
@@ -58,6 +62,34 @@ def _ask(
     found = answer.status, dict(answer.getheaders()), answer.read()
     connection.close()
     return found
+
+
+def test_a_connection_that_sends_slowly_is_closed(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watch_server, "_TIMEOUT_S", 0.3)
+    with socket.create_connection(("127.0.0.1", server.server_port), timeout=0.1) as slow:
+        for _ in range(100):  # 10 s; a byte every 0.1 s
+            slow.send(b"G")
+            with contextlib.suppress(TimeoutError):
+                assert slow.recv(1) == b""  # closed
+                return
+    raise AssertionError
+
+
+def test_too_many_connections_are_closed_at_once(server: Server) -> None:
+    address, most = ("127.0.0.1", server.server_port), watch_server._MOST
+    with contextlib.ExitStack() as held:
+        every = [
+            held.enter_context(socket.create_connection(address, timeout=5))
+            for _ in range(most + 20)
+        ]
+        assert every[-1].recv(1) == b""
+        assert threading.active_count() < most + 10
+    deadline = time.monotonic() + 30
+    while server._begun and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert _ask(server, "/state.json")[0] == 200
 
 
 def test_it_listens_on_the_loopback_alone(server: Server) -> None:
@@ -290,6 +322,26 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     ):
         newest.record(views.settings, views.drawn.history)
     assert not mark.exists()
+
+
+@pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN"])
+def test_an_update_that_is_no_number_counts_as_none(tmp_path: Path, number: str) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    (run / "metrics.jsonl").write_text(f'{{"update": {number}, "seed": 0}}\n')
+    assert standing.progress(run, 1).done == 0
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", ".lock", "pipe"])
+def test_a_pipe_in_the_directory_is_said_without_waiting(tmp_path: Path, name: str) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    views = Views(WatchConfig(run=str(run)))
+    (run / name).unlink(missing_ok=True)
+    os.mkfifo(run / name)
+    said = f"{run / name} is neither a file nor a folder: remove it."
+    assert views.state()["sentence"] == said
+    views.draw()
+    with pytest.raises(ConfigError, match="is neither a file nor a folder"):
+        Views(WatchConfig(run=str(run)))
 
 
 def test_a_seed_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
