@@ -8,6 +8,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"  # Set before anything imports JAX.
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_optimization_level=0"
 
 import functools
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +26,14 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]
+
+# A shell that starts pytest with `&` has it ignore signals, and commands keep them ignored.
+for _number, _handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 hypothesis.settings.register_profile("swarmjax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("swarmjax")

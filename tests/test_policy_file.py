@@ -210,7 +210,7 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _with("normalizer/std", _f32([[1] * (SIZE - 1) + [0]])),
             {},
-            r"normalizer/std holds a value of 0 or less",
+            r"normalizer/std holds a value below 1\.18e-38",
         ),
         (
             _GOOD,

@@ -33,8 +33,9 @@ def main(arguments: Sequence[str]) -> int:
     settings, said = witness.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
     keep = None if out is None else unfinished.place(out)
-    if out is not None:
-        outputs.check("out", _files(out), overwrite=settings.overwrite)
+    if out is not None and keep is not None:
+        written = [*_files(out), keep / unfinished.ABOUT]
+        outputs.check("out", written, overwrite=settings.overwrite)
         _check_out(out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal

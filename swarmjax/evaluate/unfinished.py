@@ -5,16 +5,17 @@ evaluation. The same command resumes from them. Another command is refused, so t
 lose hours of work.
 """
 
+import contextlib
 import hashlib
 import json
-import shutil
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from swarmjax import provenance
+from swarmjax import outputs, provenance
 from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
@@ -22,7 +23,7 @@ from swarmjax.evaluate.trials import Entrant, Trial, specialise
 from swarmjax.outputs import replacing
 
 _NAME = "unfinished"
-_ABOUT = "evaluation.json"
+ABOUT = "evaluation.json"
 # Keys for places of files and numbers of processes, which change no figure. For files that matter,
 # digests are compared.
 _ELSEWHERE = ("policy", "compare", "suite", "out", "workers", "extensions")
@@ -92,7 +93,7 @@ def read(folder: Path, judged: Mapping[str, Any], cells: Sequence[Cell]) -> dict
     paths = {row: path for row, path in paths.items() if path.exists()}
     if not paths:
         return {}
-    before = reading.parse_json(reading.read_text(folder / _ABOUT), str(folder / _ABOUT))
+    before = reading.parse_json(reading.read_text(folder / ABOUT), str(folder / ABOUT))
     key = _first_difference(before, judged)
     if key is not None:
         raise ConfigError(
@@ -117,8 +118,9 @@ def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> No
     arrays = {"shortest": trial.shortest, "arrival": trial.arrival}
     arrays |= {f"found/{name}": table for name, table in trial.found.items()}
     try:
-        with replacing(folder / _ABOUT) as temporary:
+        with replacing(folder / ABOUT) as temporary:
             temporary.write_text(json.dumps(judged, indent=2) + "\n")
+        outputs.note([folder / ABOUT])
         with replacing(_path(folder, row)) as temporary, temporary.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
     except OSError as error:
@@ -126,13 +128,20 @@ def write(folder: Path, judged: Mapping[str, Any], row: int, trial: Trial) -> No
 
 
 def remove(folder: Path) -> None:
-    """Removes the saved cells, once the result is written."""
-    shutil.rmtree(folder, ignore_errors=True)
+    """Removes the saved cells, and the folder if it holds nothing else."""
+    with contextlib.suppress(OSError):
+        for path in [*_cells(folder), folder / ABOUT, folder / outputs.NOTES]:
+            path.unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def count(folder: Path) -> int:
     """Counts the saved cells."""
-    return len(list(folder.glob("cell*.npz")))
+    return len(_cells(folder))
+
+
+def _cells(folder: Path) -> list[Path]:
+    return [path for path in folder.glob("cell*.npz") if re.fullmatch(r"cell\d+", path.stem)]
 
 
 def _path(folder: Path, row: int) -> Path:

@@ -25,6 +25,7 @@ NETWORK_FORMAT = 3  # for a policy whose network is an extension's code, which i
 NETWORK = "network/"  # how the names of an extension's arrays begin
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
+_SMALLEST = float(np.finfo(np.float32).tiny)
 _MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
 _MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
@@ -379,8 +380,11 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool)
             f"actor/log_std holds a value above {_MOST_LOG_STD:g}: expected the logarithm of a "
             "deviation."
         )
-    if (arrays["normalizer/std"] <= 0).any():
-        raise PolicyError("normalizer/std holds a value of 0 or less, but it is a divisor.")
+    if (arrays["normalizer/std"] < _SMALLEST).any():
+        raise PolicyError(
+            f"normalizer/std holds a value below {_SMALLEST:.3g}, but it is a divisor, and devices "
+            "take smaller numbers for 0."
+        )
 
 
 def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:

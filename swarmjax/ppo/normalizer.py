@@ -82,10 +82,10 @@ def update(
     share = batch_count / jnp.maximum(count, 1.0)
     shift = batch_mean - normalizer.mean
     spread = batch_variance + (1.0 - share) * shift**2
+    # The first batch replaces the variance of 1, from which a small one would lose digits.
+    before = jnp.where(share == 1.0, spread, normalizer.variance)
     mean, mean_rest = _add(normalizer.mean, share * shift + normalizer.rest[0])
-    variance, variance_rest = _add(
-        normalizer.variance, share * (spread - normalizer.variance) + normalizer.rest[1]
-    )
+    variance, variance_rest = _add(before, share * (spread - before) + normalizer.rest[1])
     return Normalizer(
         count=count,
         mean=mean,

@@ -11,8 +11,7 @@ from typing import Any
 from swarmjax.config import ConfigError
 from swarmjax.report import rows as report_rows
 from swarmjax.reproduce.config import ARMS, Arm, ReproduceConfig
-from swarmjax.run import checkpoint, compile_cache, lifecycle, memory
-from swarmjax.run.checkpoint import CheckpointError
+from swarmjax.run import compile_cache, lifecycle, memory
 from swarmjax.run.display import Display
 from swarmjax.run.load_settings import from_stored, load_train, read_config
 from swarmjax.run.settings import TrainConfig
@@ -95,21 +94,18 @@ def run(made: TrainConfig, stop: Stop) -> bool:
 
 
 def _go_on(made: TrainConfig, directory: Path) -> TrainConfig:
-    """Resumes an arm that has begun; an arm killed before its first checkpoint starts again."""
+    """Resumes an arm that has begun; without a checkpoint it begins from its seed."""
     if not (directory / "config.json").exists():
         return made
     stored = from_stored(read_config(directory), "stored ")
-    kept = replace(made, run=replace(made.run, dir=stored.run.dir), init_from=stored.init_from)
+    run = replace(made.run, dir=stored.run.dir, id=stored.run.id)
+    kept = replace(made, run=run, init_from=stored.init_from)
     if kept != stored:
         raise ConfigError(
             f"{directory} holds a run whose config differs from the one that this version makes: "
             "give another out."
         )
-    try:
-        checkpoint.restore(directory)
-    except CheckpointError:
-        return made
-    return replace(made, resume=str(directory))
+    return replace(made, run=run, resume=str(directory))
 
 
 def summaries(out: Path) -> dict[Arm, dict[str, Any]]:

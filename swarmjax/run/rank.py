@@ -81,9 +81,8 @@ def _wait(child: subprocess.Popen[str], stop: Stop) -> int:
     """Waits for a child, and passes the first signal on."""
     told = False
     while (code := child.poll()) is None:
-        if stop.signalled and not told:
-            number = next(each for each, code in CODES.items() if code == stop.code)
-            child.send_signal(number)
+        if stop.number is not None and not told:
+            child.send_signal(stop.number)
             told = True
         time.sleep(_TICK_S)
     return code

@@ -35,6 +35,7 @@ class Stop:
 
     Attributes:
       code: the exit code for the first signal; None if there was none.
+      number: the first signal; None if there was none.
       signalled: whether a stop was requested, by a signal or by setting this attribute.
     """
 
@@ -53,6 +54,7 @@ class Stop:
         self.signalled = False
         self._patient, self._last = patient, last
         self.code: int | None = None
+        self.number: int | None = None
         self._until = until
 
     @property
@@ -89,7 +91,7 @@ class Stop:
 
     def _ask(self, number: int, _: FrameType | None) -> None:
         if self.code is None:
-            self.code = CODES[signal.Signals(number)]
+            self.code, self.number = CODES[signal.Signals(number)], number
         self.signalled = True
 
 

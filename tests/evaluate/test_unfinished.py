@@ -85,6 +85,7 @@ def test_the_same_command_goes_on_after_a_stop(
     stopped = _stop([*words, "out=stopped"], number)
     assert stopped.returncode == code
     assert sorted(_content(Path("stopped"))) == [
+        "unfinished/.swarmjax.json",
         "unfinished/cell0.npz",
         "unfinished/evaluation.json",
     ]
@@ -105,7 +106,8 @@ def test_the_same_command_goes_on_after_a_stop(
     assert "1 of 2 cells were judged before" in capsys.readouterr().out
     assert _command(monkeypatch, *words, "out=whole") == 0
     whole = _content(Path("whole"))
-    assert sorted(whole) == ["levels.csv", "measures.png", "result.json", "times.png"]
+    made = [".swarmjax.json", "levels.csv", "measures.png", "result.json", "times.png"]
+    assert sorted(whole) == made
     assert _content(Path("stopped")) == whole
 
 

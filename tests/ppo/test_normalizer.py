@@ -48,6 +48,12 @@ def test_small_deviations_on_a_large_offset_keep_their_variance() -> None:
     np.testing.assert_allclose(state.variance, [0.5 / 3.0], rtol=1e-6)
 
 
+def test_a_small_variance_of_the_first_batch_keeps_its_digits() -> None:
+    observation = np.array([[1e-3], [-1e-3]], np.float32)
+    state = normalizer.update(normalizer.init(1), observation, np.ones(2, bool))
+    np.testing.assert_allclose(state.variance, [1e-6], rtol=1e-6)  # float32
+
+
 def test_rounding_does_not_add_up() -> None:
     def exact(count: float, mean: float, variance: float) -> tuple[float, float]:
         """Merges the same batch again and again, in float64, with the formula of two sets."""

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from sentences import refusal
@@ -73,6 +74,22 @@ def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
         f"{run} holds a run whose config differs from the one that this version makes: "
         "give another out."
     )
+
+
+def test_an_arm_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
+    (tmp_path / "baseline").mkdir()
+    stored = to_dict(replace(made, run=replace(made.run, id="first")))
+    (tmp_path / "baseline" / "config.json").write_text(json.dumps(stored))
+    trained: list[TrainConfig] = []
+
+    def carry_out(settings: TrainConfig, *_: object) -> SimpleNamespace:
+        trained.append(settings)
+        return SimpleNamespace(update=settings.updates)
+
+    monkeypatch.setattr(reproduce_arms.lifecycle, "carry_out", carry_out)
+    assert reproduce_arms.run(made, Stop())
+    assert (trained[0].resume, trained[0].run.id) == (str(tmp_path / "baseline"), "first")
 
 
 @pytest.mark.parametrize("spent", [True, False])
