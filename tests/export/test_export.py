@@ -19,6 +19,7 @@ from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
+from swarmjax.run import directory
 from swarmjax.run.load_settings import load_train, read_config
 from swarmjax.run.policy_export import policy_arrays, policy_meta
 from swarmjax.run.settings import TrainConfig
@@ -64,7 +65,7 @@ def test_a_policy_file_is_exported_beside_itself(
     assert export.main([f"policy={path}", f"format={form}"]) == 0
     out = tmp_path / FORMATS[form]
     assert capsys.readouterr().out == f"{out}: the policy of {path}.\n"
-    assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", FORMATS[form]}
+    assert set(directory.visible(tmp_path)) == {"policy.npz", FORMATS[form]}
     # Exports to a second place, and again to the same place, give the same bytes.
     other = tmp_path / "other" / FORMATS[form]
     assert export.main([f"policy={path}", f"format={form}", f"out={other}"]) == 0
@@ -195,7 +196,7 @@ def test_a_step_is_named_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert policy_file.read(tmp_path / "policy-step100.npz").meta["update"] == 100
     assert policy_file.read(final).digest == before.digest
     assert export.main([f"run={tmp_path}", "step=100", "format=c"]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {
+    assert set(directory.visible(tmp_path)) == {
         "config.json", "policy.npz", "policy-step100.npz", "policy_c-step100"
     }  # fmt: skip
 
@@ -271,4 +272,6 @@ def test_a_file_whose_writing_breaks_off_is_as_it_was(
     monkeypatch.setattr("os.fsync", crash)
     with pytest.raises(KeyboardInterrupt):
         export_folder.write_file(tmp_path / "a", b"2")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1"}
+    assert {name: (tmp_path / name).read_bytes() for name in directory.visible(tmp_path)} == {
+        "a": b"1"
+    }

@@ -14,8 +14,10 @@ from swarmjax.run.signals import Stop, StoppedError
 
 # A program that listens for signals, prints so, and then waits as its argument says.
 _PROCESS = """
-import ctypes, sys, time
+import ctypes, signal, sys, time
 from swarmjax.run.signals import Stop
+for number in sys.argv[2:]:  # as nohup and a shell's & do
+    signal.signal(int(number), signal.SIG_IGN)
 with Stop() as stop:
     print("listening", flush=True)
     if sys.argv[1] == "poll":
@@ -30,14 +32,8 @@ sys.exit(stop.code)
 
 
 def _start(how: str, ignored: Sequence[int] = ()) -> subprocess.Popen:
-    code = [sys.executable, "-c", _PROCESS, how]
-    process = subprocess.Popen(
-        code,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: [signal.signal(number, signal.SIG_IGN) for number in ignored],
-    )
+    code = [sys.executable, "-c", _PROCESS, how, *map(str, map(int, ignored))]
+    process = subprocess.Popen(code, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "listening\n"
     return process

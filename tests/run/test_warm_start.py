@@ -114,7 +114,7 @@ def test_networks_and_normaliser_are_carried_and_nothing_else(trained: Path) -> 
     carried = {name for name in found if name.startswith(CARRIED)}
     # The networks have a kernel and a bias in each of 2 x 2 layers, and log_std. The normaliser has
     # count, mean and variance.
-    assert len(carried) == 2 * 2 * 2 + 1 + 3
+    assert len(carried) == 2 * 2 * 2 + 1 + 4
     for name, leaf in found.items():
         expected = learned[name] if name in carried else fresh[name]
         np.testing.assert_array_equal(leaf, expected, err_msg=name, strict=True)
