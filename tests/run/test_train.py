@@ -383,6 +383,7 @@ def test_a_new_run_wants_an_empty_folder(
 def test_what_a_killed_start_leaves_is_no_obstacle(tmp_path: Path) -> None:
     (tmp_path / ".lock").touch()
     (tmp_path / ".config.77.tmp.json").touch()
+    assert directory.visible(tmp_path) == []
     lifecycle.check_free(tmp_path, load_train([*TINY, f"run.dir={tmp_path}"]))
 
 
