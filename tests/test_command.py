@@ -1,5 +1,6 @@
 """Tests the `--help` texts and the examples of every command."""
 
+import importlib.util
 import json
 import os
 import shlex
@@ -135,7 +136,12 @@ def test_a_command_does_its_work_although_nobody_reads(
     assert (run / "report" / "report.html").exists() == ("run=run" in line)
 
 
-@pytest.mark.parametrize("value", ["foo", "cuda"])
+_NO_CUDA = pytest.mark.skipif(
+    importlib.util.find_spec("jax_cuda13_plugin") is not None, reason="JAX finds a GPU here"
+)
+
+
+@pytest.mark.parametrize("value", ["foo", pytest.param("cuda", marks=_NO_CUDA)])
 def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, value: str) -> None:
     done = _shell(f"JAX_PLATFORMS={value} $RUN.train stage=s1 run.dir=run", tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
