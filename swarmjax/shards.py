@@ -60,12 +60,12 @@ class Shards:
         """Derives a random key for this device from a key that all devices share."""
         return key if self.devices == 1 else jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
-    def local(self, x: Array) -> Array:
-        """Selects this device's arenas from the values [A, ...] of all arenas."""
+    def local(self, x: Array, axis: int = 0) -> Array:
+        """Selects this device's arenas from the values of all arenas along `axis`."""
         if self.devices == 1:
             return x
-        size = x.shape[0] // self.devices
-        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * size, size)
+        size = x.shape[axis] // self.devices
+        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * size, size, axis)
 
     def draw(self, key: Array, sample: Callable[[Array], Array], axis: int = 0) -> Array:
         """Draws random numbers for the arenas of this device, with a separate key per stream.

@@ -36,7 +36,6 @@ def row(update: int, seed: int = 0, **given: object) -> dict:
         "complete_by_stage": [None, None],
         "contacts_by_stage": [None, None],
         "return_by_stage": [None, None],
-        "progress_by_stage": [None, None],
         "episodes_by_stage": [None, None],
         **given,
     }

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 from swarmjax.curriculum.engine import REASONS, REWEIGHED, STAYED
 
-_OF_LEVELS = ("held", "success", "score")
-
 
 def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
     """Turns rows of metrics into the decision log.
@@ -17,14 +15,12 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
       seed: seed to write into the entries.
 
     Returns:
-      One entry for each decision: `update`, `seed` and `why`. A promotion or demotion also has
+      One entry for each decision: `update`, `seed` and `why`. A promotion also has
       `from`, `to` and the results on the stage that was left (`targets_reached`, `all_reached`,
-      `episodes`). New weights have `weights` and `success`, by stage. With a curriculum over
-      levels, the entry also has `levels`. For each stage it gives the number of levels in the
-      buffer (`held`), and the mean `success` and `score` of these levels.
+      `episodes`). New weights have `weights` and `success`, by stage.
     """
     return [
-        {"update": row["update"], "seed": seed, **_entry(row, names), **_levels(row, names)}
+        {"update": row["update"], "seed": seed, **_entry(row, names)}
         for row in rows
         if row["decision"] != STAYED
     ]
@@ -49,12 +45,3 @@ def _entry(row: dict, names: Sequence[str]) -> dict:
             "episodes": row["episodes_by_stage"][left],
         }
     )
-
-
-def _levels(row: dict, names: Sequence[str]) -> dict:
-    """Describes the practised levels, if there is a buffer of levels."""
-    if "levels_held" not in row:
-        return {}
-    told = [row[f"levels_{key}"] for key in _OF_LEVELS]
-    each = [dict(zip(_OF_LEVELS, of_stage, strict=True)) for of_stage in zip(*told, strict=True)]
-    return {"levels": dict(zip(names, each, strict=True))}

@@ -153,14 +153,6 @@ class AlgoConfig(Section):
             "ends; leak: goes on into the next episode [monte_carlo]; null: bootstrap or terminal"
         ),
     )
-    team_reward: float = field(
-        default=0.0,
-        metadata=about(
-            "weight of the mean reward of the arena in a robot's reward; its own has the rest",
-            0.0,
-            1.0,
-        ),
-    )
     clip_epsilon: float = field(
         default=0.2,
         metadata=about("range of the probability ratio: 'PPO epsilon clip'", above=0.0),

@@ -1,9 +1,8 @@
 """`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: reports the results of runs.
 
 For one run it writes `mix.png`, `success.png`, `curves.png`, and `report.html`, which holds all
-figures. With a curriculum over levels it also writes `levels.png` and `practised.png`. If the
-stages make a grid, it also writes `grid.png`. The run may still be going or may have been killed:
-the report leaves out a line that is not fully written. No JAX.
+figures. If the stages make a grid, it also writes `grid.png`. The run may still be going or may
+have been killed: the report leaves out a line that is not fully written. No JAX.
 
 For several runs it prints a table: see `table`. With `out` it also writes the table there, as
 `report.html` and `report.json`.
@@ -47,15 +46,9 @@ def write(
     history = rows.read(run)
     loggers = report_send.of_run(run, history) if send else []
     # Importing Matplotlib takes a second. Errors above should come without that delay.
-    from swarmjax.pages import figures as drawing
     from swarmjax.report import figures as report_figures
-    from swarmjax.report import levels as report_levels
 
     figures = report_figures.draw(history)
-    best = report_levels.read(run, history.config)
-    pictures = None if best is None else report_levels.draw(best, history.config)
-    if pictures is not None:
-        figures["practised"] = drawing.png(pictures)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     written = builder.write(out, content, overwrite=overwrite)

@@ -42,12 +42,11 @@ def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, `curves` if the run recorded them, `levels` if it has a
-      curriculum over levels, and `grid` if the stages make one. The same run gives the same files,
-      since they do not hold Matplotlib's version.
+      PNG files by name: `mix`, `success`, `curves` if the run recorded them, and `grid` if the
+      stages make one. The same run gives the same files, byte for byte.
     """
     files = {}
-    makers = {"mix": mix, "success": success, "curves": curves, "levels": levels, "grid": grid}
+    makers = {"mix": mix, "success": success, "curves": curves, "grid": grid}
     for name, make in makers.items():
         figure = make(history)
         if figure is not None:
@@ -172,46 +171,6 @@ def curves(history: History) -> Figure | None:
     figure.supxlabel(_STEPS, fontsize=10)
     drawing.explain(figure, _seed_lines(history), 2)
     return figure
-
-
-def levels(history: History) -> Figure | None:
-    """Draws what the curriculum over levels did, one colour per stage, as the mean over seeds.
-
-    Returns None if the run has no curriculum over levels.
-    """
-    if history.levels is None:
-        return None
-    found = history.levels
-    ended = sum(found[f"levels_{kind}"] for kind in ("fresh", "replayed", "mutated"))
-    again = found["levels_replayed"] + found["levels_mutated"]
-    measures = {
-        "levels kept": found["levels_held"],
-        "episodes that began on them or a mutated one": _shares(again, np.asarray(ended)),
-        "success on the levels kept": found["levels_success"],
-        "mean score of the levels kept": found["levels_score"],
-    }
-    figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True).ravel()
-    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))
-    for panel, (title, values) in zip(panels, measures.items(), strict=True):
-        for i, colour in enumerate(colours):
-            steps, seeds = _stretched(history.arena_steps, values[..., i])
-            panel.plot(steps, report_rows.together(seeds), color=colour, lw=1.6)
-        panel.set_title(title, loc="left", fontsize=10, pad=3)
-        panel.grid(visible=True, alpha=0.25)
-        panel.set_ylim(bottom=0.0)
-    panels[0].set_xlim(0, history.arena_steps[-1])
-    panels[0].xaxis.set_major_formatter(drawing.thousands())
-    for panel in panels[1:3]:
-        panel.yaxis.set_major_formatter(drawing.percent())
-    figure.supxlabel(_STEPS, fontsize=10)
-    _name_colours(figure, list(panels), history.names)
-    return figure
-
-
-def _shares(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Divides counts; gives nan where nothing was counted."""
-    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 
 def grid(history: History) -> Figure | None:

@@ -25,11 +25,6 @@ _CAPTIONS = {
     "curves": "Learning curves over updates. Return and contacts are sums over an episode, and "
     "means over the robots of the episodes that ended in the update. Short episodes end first, so "
     "the first values mean little. The entropy of the policy's actions is in nats.",
-    "levels": "The curriculum over levels: how many levels of each stage are kept, how many "
-    "episodes began on one of them, and the success and score of these levels.",
-    "practised": "The levels of each stage with the highest scores, from the newest checkpoint of "
-    "the first seed: success over the remembered episodes, and the score. Robots are discs, their "
-    "targets circles of the same colour.",
     "grid": "Last success of each cell, in percent. Grey cells are not stages of this run.",
 }
 

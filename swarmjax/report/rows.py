@@ -30,19 +30,9 @@ BY_STAGE = (
     "complete_by_stage",
     "contacts_by_stage",
     "return_by_stage",
-    "progress_by_stage",
     "episodes_by_stage",
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
-# What the curriculum over levels did on each stage, if there is one.
-LEVELS = (
-    "levels_fresh",
-    "levels_replayed",
-    "levels_mutated",
-    "levels_held",
-    "levels_success",
-    "levels_score",
-)
 # Numbers of a whole update; the first two cover the episodes that ended in it.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # with more stages than this, each is drawn small
@@ -91,7 +81,6 @@ class History:
       seconds: training time up to the last update; None if it was not recorded.
       decisions: the curriculum's decisions as recorded, sorted by seed and update.
       summary: the run's summary as recorded; empty before the run ends.
-      levels: [N, T, S] for each name in `LEVELS`; None without a curriculum over levels.
     """
 
     config: TrainConfig
@@ -105,7 +94,6 @@ class History:
     seconds: float | None
     decisions: list[Row]
     summary: Row
-    levels: dict[str, np.ndarray] | None = None
 
     @property
     def names(self) -> list[str]:
@@ -129,7 +117,7 @@ def read(run: Path) -> History:
     stages = len(trained.stage)
     by_seed: dict[int, dict[int, Row]] = {}
     for where, raw in read_lines(run, recorder.METRICS):
-        row = _checked(raw, stages, where, levels=trained.curriculum.levels.is_on)
+        row = _checked(raw, stages, where)
         by_seed.setdefault(row["seed"], {})[row["update"]] = row
     updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
     if not updates:
@@ -206,8 +194,7 @@ def _history(
     lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
     curves = np.array([[row["curves"] for row in of_seed] for of_seed in rows])
     every = np.moveaxis(lists, 2, 0)
-    columns = dict(zip(_LISTS, every, strict=False))
-    kept: dict[str, np.ndarray] = dict(zip(LEVELS, every[len(_LISTS) :], strict=False))
+    columns = dict(zip(_LISTS, every, strict=True))
     mix = np.nan_to_num(columns["mix"])
     return History(
         config=trained,
@@ -221,25 +208,23 @@ def _history(
         seconds=rows[0][-1].get("train_s"),
         decisions=rest[0],
         summary=rest[1],
-        levels=kept or None,
     )
 
 
-def _checked(raw: Row, stages: int, where: str, *, levels: bool) -> Row:
-    """Takes the values that a report needs from a row; with `levels` also those of the levels.
+def _checked(raw: Row, stages: int, where: str) -> Row:
+    """Takes the values that a report needs from a row.
 
     Lists become one float32 array [.., S]. The curves become one array, with nan for a missing
     one.
     """
-    keys = (*_LISTS, *(LEVELS if levels else ()))
-    for key in (*_NUMBERS, *keys):
+    for key in (*_NUMBERS, *_LISTS):
         if key not in raw:
             raise ConfigError(
                 f"{where} has no {key}: the run is from a version that did not write it."
             )
     check(raw, _NUMBERS, WHOLE, where)
     check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
-    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in keys]
+    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
     return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
         "lists": np.array(lists),
         "curves": np.array([raw.get(key) for key in CURVES], np.float32),

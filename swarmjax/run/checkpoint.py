@@ -34,7 +34,7 @@ import numpy as np
 from absl import logging as absl_logging
 
 from swarmjax.policy import digest
-from swarmjax.run import directory, heap, hosts, practised
+from swarmjax.run import directory, heap, hosts
 from swarmjax.run.errors import CheckpointError, TrainingError
 
 # Importing Orbax takes half a second. A run imports it while XLA compiles (`trainer`).
@@ -225,9 +225,6 @@ class Checkpoints:
             raise FileExistsError("a newer checkpoint exists")
         step = self._folder / str(update)
         directory.write_json(step / _MANIFEST, _file_digests(step))
-        best = practised.best(leaves)
-        if best is not None:
-            directory.write_json(self._run / practised.FILE, best)
         with directory.Log(self._run / directory.SAVED) as log:
             log.write([{"update": update, "digest": meta["digest"], **told}])
         self._prune()

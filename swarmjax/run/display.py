@@ -18,7 +18,6 @@ Row = Mapping[str, Any]
 LINE_SECONDS = 2.0  # shortest time between two plain lines
 MOST_STAGES = 8  # with more stages, the table shows only three of them
 GOOD = 0.9  # a stage counts as good if it reaches a larger share of its targets
-_OF_LEVELS = ("levels kept", "success on them", "episodes on them")
 _SPEEDS = (
     ("arena steps/s", "arena_steps_per_s"),
     ("robot steps/s", "robot_steps_per_s"),
@@ -35,21 +34,6 @@ class Spread(NamedTuple):
     high: float
 
 
-class LevelsState(NamedTuple):
-    """State of a stage's level buffer, mean over seeds.
-
-    Attributes:
-      held: levels in the buffer.
-      success: success on these levels, 0 to 1; None if the buffer is empty.
-      again: share of episodes on kept or mutated levels, among the episodes that ended in the
-        newest update; None if none ended.
-    """
-
-    held: float
-    success: float | None
-    again: float | None
-
-
 class StageState(NamedTuple):
     """State of a stage.
 
@@ -58,13 +42,11 @@ class StageState(NamedTuple):
       arenas: share of the arenas that are on this stage, mean over seeds.
       success: share of targets reached in the stage's newest measurement, over the seeds that have
         measured it; None if no seed has.
-      levels: state of the stage's level buffer; None without a curriculum over levels.
     """
 
     name: str
     arenas: float
     success: Spread | None
-    levels: LevelsState | None = None
 
 
 def summarize(rows: Sequence[Row], names: Sequence[str]) -> dict[str, Any]:
@@ -137,27 +119,7 @@ def _stage(last: Sequence[Row], index: int, name: str) -> StageState:
     """Returns the state of a stage, by the last row of each seed."""
     arenas = sum(row["mix"][index] / sum(row["mix"]) for row in last) / len(last)
     success = spread([row["success_by_stage"][index] for row in last])
-    return StageState(name, arenas, success, _levels(last, index))
-
-
-def _levels(last: Sequence[Row], index: int) -> LevelsState | None:
-    """Returns the state of a stage's level buffer, by the last row of each seed."""
-    if "levels_held" not in last[0]:
-        return None
-
-    def each(key: str) -> list[float | None]:
-        return [row[f"levels_{key}"][index] for row in last]
-
-    def total(key: str) -> float:
-        return sum(value or 0.0 for value in each(key))
-
-    success, again = spread(each("success")), total("replayed") + total("mutated")
-    ended = again + total("fresh")
-    return LevelsState(
-        held=total("held") / len(last),
-        success=None if success is None else success.mean,
-        again=again / ended if ended else None,
-    )
+    return StageState(name, arenas, success)
 
 
 @contextlib.contextmanager
@@ -253,7 +215,7 @@ def _table(summary: Row, speeds: Row, updates: int, seconds_left: float) -> Grou
     for a, b in zip(left, right, strict=True):
         table.add_row(*a, *b)
     stages = summary["stages"]
-    several = len(stages) > 1 or any(stage.levels for stage in stages)
+    several = len(stages) > 1
     return Group(table, _stage_table(stages)) if several else Group(table)
 
 
@@ -266,8 +228,7 @@ def _stage_table(stages: Sequence[StageState]) -> Table:
     table = Table(
         caption=_counted(stages), caption_justify="left", box=box.SIMPLE_HEAD, show_edge=False
     )
-    kept = any(stage.levels for stage in stages)
-    for heading in ("stage", "arenas", "targets reached", *(_OF_LEVELS if kept else ())):
+    for heading in ("stage", "arenas", "targets reached"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
     shown = [("", stage) for stage in stages]
     if len(stages) > MOST_STAGES:
@@ -277,16 +238,8 @@ def _stage_table(stages: Sequence[StageState]) -> Table:
             shown += [("best: ", measured[-1]), ("worst: ", measured[0])]
     for what, stage in shown:
         arenas, name = f"{100 * stage.arenas:.0f} %", f"{what}{stage.name}"
-        table.add_row(name, arenas, _percent(stage.success), *_levels_cells(stage.levels))
+        table.add_row(name, arenas, _percent(stage.success))
     return table
-
-
-def _levels_cells(levels: LevelsState | None) -> tuple[str, ...]:
-    """Formats the state of a level buffer for the columns `_OF_LEVELS`; empty without a buffer."""
-    if levels is None:
-        return ()
-    shares = ("-" if x is None else f"{100 * x:.0f} %" for x in (levels.success, levels.again))
-    return (f"{levels.held:,.0f}", *shares)
 
 
 def _measured(stages: Sequence[StageState]) -> list[StageState]:

@@ -235,7 +235,6 @@ def _load(settings: TrainConfig) -> tuple[Built, Schedule, Any, TrainState]:
     program, schedule = programs.load(settings, by_robot=settings.run.episodes)
     init = jax.jit(mesh.init(program))  # traced once, both for the shapes and for the state
     template = init.eval_shape(schedule)
-    memory.check_buffer(settings, seeds.size(template.curriculum.levels), memory.limit())
     memory.check_state(settings, mesh.bytes_each(settings, template), memory.limit())
     return program, schedule, init, template
 
@@ -425,7 +424,7 @@ def _own_pieces(settings: TrainConfig) -> str:
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     """Warns, in at most one sentence, if the budget is too short for the stages."""
     share = settings.curriculum.budget_share
-    if share is None or settings.curriculum.prerequisites:
+    if settings.curriculum.mode == "adaptive":
         return []
     begins, latest = curriculum.last_begins(schedule), math.ceil(share * settings.updates)
     if begins <= latest:

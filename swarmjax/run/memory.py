@@ -44,27 +44,6 @@ def _host_memory() -> int | None:
         return None
 
 
-def check_buffer(settings: TrainConfig, needed: int, available: int | None) -> None:
-    """Refuses a buffer of levels that alone is larger than the memory.
-
-    Args:
-      settings: the run's config.
-      needed: memory for the buffers of all seeds, bytes. A device holds each buffer whole.
-      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
-
-    Raises:
-      ConfigError: if the buffer cannot fit. The message names a size that is certainly too large.
-    """
-    if available is not None and needed > available:
-        levels = settings.curriculum.levels.buffer or 0
-        each = f" for each of {settings.seeds} seeds" if settings.seeds > 1 else ""
-        raise ConfigError(
-            f"curriculum.levels.buffer is {levels}{each}, which needs {_gib(needed)} of memory, "
-            f"and there is {_gib(available)}: give less than {int(levels * available / needed)}, "
-            "or train on a device with more."
-        )
-
-
 def check_state(settings: TrainConfig, needed: int, available: int | None) -> None:
     """Refuses a run whose state alone is too large, before anything is compiled.
 

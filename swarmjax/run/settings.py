@@ -7,7 +7,6 @@ from typing import ClassVar, Literal
 from swarmjax import words
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.task import mutation
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
@@ -200,7 +199,7 @@ class TrainConfig(ProgramConfig):
                     )
 
     def _check_prerequisites(self) -> None:
-        first, stages = self.curriculum.prerequisites or 0, len(self.stage)
+        first, stages = self.curriculum.prerequisites, len(self.stage)
         if first and first >= stages:
             raise ConfigError(
                 f"curriculum.prerequisites is {first}, but the run has "
@@ -252,16 +251,11 @@ class TrainConfig(ProgramConfig):
 
     def _check_levels(self) -> None:
         levels = self.curriculum.levels
-        if not levels.is_on:
-            return
-        if levels.buffer is not None and levels.buffer < len(self.stage):
+        if levels.mode != "random" and levels.buffer < len(self.stage):
             raise ConfigError(
                 f"curriculum.levels.buffer is {levels.buffer}, but {len(self.stage)} stages share "
                 f"it equally: give at least {len(self.stage)}."
             )
-        if levels.mutates:
-            for stage in self.stage:
-                mutation.check(stage)
 
     def _check_algo(self) -> None:
         if self.task.history > 1 and self.algo.memory != "none":
@@ -270,16 +264,10 @@ class TrainConfig(ProgramConfig):
                 "choose one, task.history=1 or algo.memory=none."
             )
         self._check_hearing()
-        self._check_team_reward()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(
                 f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
                 f"32 bits: give at most {MAX_COUNT}."
-            )
-        if self.curriculum.normalizer == "relearn" and not self.algo.normalize_observations:
-            raise ConfigError(
-                "curriculum.normalizer is relearn, but algo.normalize_observations is false: "
-                "give keep or algo.normalize_observations=true."
             )
 
     def _check_hearing(self) -> None:
@@ -294,17 +282,6 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
                 "works only with hidden layers: give algo.network=mlp or task.neighbours.count=0."
-            )
-
-    def _check_team_reward(self) -> None:
-        """Refuses shared rewards if a robot's return ends at its arrival."""
-        if not self.algo.team_reward:
-            return
-        if self.algo.advantage == "monte_carlo" and self.task.arrival == "latch":
-            raise ConfigError(
-                f"algo.team_reward is {show(self.algo.team_reward)}, but algo.advantage is "
-                "monte_carlo and task.arrival is latch, so returns end at a robot's arrival: give "
-                "algo.advantage=gae, task.arrival=hold or algo.team_reward=0."
             )
 
     def _check_budget(self) -> None:

@@ -80,7 +80,7 @@ class Tally:
       targets_reached: share of targets reached on each stage, as last measured, by seed.
       earlier_s: seconds of training before this process began.
       seconds: seconds of training in this process, without compilation.
-      decisions: promotions and demotions.
+      decisions: promotions.
       barren: how many of the newest updates in a row taught nothing, by seed. In such an update
         every gradient step was skipped, or every arena broke at every step.
     """

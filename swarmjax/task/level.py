@@ -105,23 +105,6 @@ def uniform_count(spacing: Spacing) -> int:
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
-def write_out(uniforms: Array, spacing: Spacing, layouts: int, xp: Any) -> Array:
-    """Appends a layout's numbers, which follow from the seed, to a level's uniform numbers.
-
-    Args:
-      uniforms: [uniform_count(spacing)] float32 in [0, 1).
-      spacing: sizes.
-      layouts: how many layout numbers to append.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      [uniform_count(spacing) + layouts] numbers; `sample` draws the same level from them.
-    """
-    seed = _seed(_split(uniforms, spacing), xp)
-    added = noise.uniform(seed, 0, Stream.LAYOUT, (layouts,), xp)
-    return xp.concatenate([uniforms, added])
-
-
 def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Draws a level of a stage.
 
@@ -132,8 +115,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     reachable, whatever the order of arrival.
 
     Args:
-      uniforms: [uniform_count(spacing)] float32 in [0, 1). The layout's numbers may follow.
-        Otherwise, they are drawn from the level's seed (see `write_out`).
+      uniforms: [uniform_count(spacing)] float32 in [0, 1).
       stage: fields [].
       spacing: sizes.
       xp: `numpy` or `jax.numpy`; both draw the same level.
@@ -151,7 +133,8 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         choose = partial(xp.where, stage.map.mapped)
         level = Level(*(choose(m, other) for m, other in zip(mapped, level, strict=True)))
     for kind, arrays in (stage.layouts or {}).items():
-        own = _of_layout(kind, uniforms, level.seed, spacing, xp)
+        count = drawing.uniform_count(kind, spacing.robots)
+        own = noise.uniform(level.seed, 0, Stream.LAYOUT, (count,), xp)
         laid_out = _laid_out(kind, arrays, own, level.seed, stage, spacing, xp)
         choose = partial(xp.where, arrays.chosen)
         level = Level(*(choose(mine, other) for mine, other in zip(laid_out, level, strict=True)))
@@ -298,15 +281,6 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
         obstacle=xp.where(there[:, None], wall, np.float32(0.5) * stage.obstacle_size),
         seed=_seed(drawn, xp),
     )
-
-
-def _of_layout(kind: Kind, uniforms: Array, seed: Array, spacing: Spacing, xp: Any) -> Array:
-    """Returns the layout's numbers: those in `uniforms`, or numbers drawn from the seed."""
-    before = uniform_count(spacing)
-    if uniforms.shape[0] > before:
-        return uniforms[before:]
-    count = drawing.uniform_count(kind, spacing.robots)
-    return noise.uniform(seed, 0, Stream.LAYOUT, (count,), xp)
 
 
 def _laid_out(

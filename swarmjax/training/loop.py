@@ -13,16 +13,16 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from swarmjax.curriculum import cohorts
 from swarmjax.curriculum import engine as curricula
-from swarmjax.curriculum import levels
-from swarmjax.curriculum.engine import Curriculum, Decision, Schedule
+from swarmjax.curriculum.engine import CurriculumState, Schedule
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
-from swarmjax.training import episodes, practice, promotion, rollout
-from swarmjax.training.practice import LevelSource
+from swarmjax.training import episodes, promotion, rollout
+from swarmjax.training.config import ProgramConfig
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
@@ -50,7 +50,7 @@ class TrainState:
 
     learners: LearnerState
     arenas: Arena
-    curriculum: Curriculum
+    curriculum: CurriculumState
     key: Array
     update: Array
 
@@ -69,9 +69,8 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     config = program.config
     start_key = jax.random.key(config.seed if seed is None else seed)
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
-    curriculum = curricula.init(schedule, config.curriculum, program.mode)
-    curriculum = replace(curriculum, levels=practice.init(config))
-    starts = _draw_first(program, schedule, curriculum, level_key)
+    curriculum = curricula.init(program.curriculum(schedule), schedule)
+    starts = _draw(program, schedule, curriculum, level_key, waiting=1)
     size, actions = program.world.observation_size, program.world.action_size
     learners = jax.vmap(
         lambda key: ppo.init(key, config.algo, size, actions, config.updates, program.state_size)
@@ -97,8 +96,9 @@ def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> Trai
       The state with arenas, and with a new cohort of the curriculum.
     """
     key, level_key = jax.random.split(state.key)
-    curriculum = curricula.begin_cohort(state.curriculum)
-    arenas = _draw_first(program, schedule, curriculum, level_key)
+    restarted = cohorts.restart(state.curriculum.cohorts)
+    curriculum = replace(state.curriculum, cohorts=restarted)
+    arenas = _draw(program, schedule, curriculum, level_key, waiting=1)
     return replace(state, arenas=arenas, curriculum=curriculum, key=key)
 
 
@@ -142,40 +142,41 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, shards = program.config, program.shards
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    waiting = _draw_waiting(program, schedule, state.curriculum, level_key)
+    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=config.waiting)
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(trajectory, config.algo, shards, state.arenas.recall)
     learners, learned = _learn(program, state.learners, batch, learn_key)
-    counted = curricula.count(state.curriculum, ended, shards)
-    curriculum, decision = curricula.advance(
-        counted, schedule, config.curriculum, program.mode, state.update
+    curriculum = curricula.observe(
+        program.curriculum(schedule),
+        schedule,
+        config.curriculum.success,
+        state.curriculum,
+        ended,
+        rollout.value_loss(batch, ended),
+        state.update,
+        shards,
     )
-    learners = promotion.carry_over(
-        learners, config, state.curriculum.met, curriculum.met, decision.promoted
-    )
+    learners = promotion.carry_over(learners, config, state.curriculum, curriculum)
+    before = state.curriculum.chosen
     metrics = {
         "update": state.update,
-        "stage": state.curriculum.stage,
-        **_curriculum_metrics(state.curriculum, curriculum, decision),
+        "stage": before.stage,
+        **_curriculum_metrics(config, state.curriculum, curriculum),
         **_learner_metrics(learned, batch, shards),
         **shards.sum(
             {
-                "mix": _mix(arenas.stage, state.curriculum.weights.shape[0]),
+                "mix": _mix(arenas.stage, before.weights.shape[0]),
                 "robots": jnp.sum(arenas.level.present),
                 "transitions": jnp.sum(trajectory.valid),
-                **_episode_metrics(ended, state.curriculum.stage),
+                **_episode_metrics(ended, before.stage),
             }
         ),
     }
     if program.by_robot:
         every = jax.tree.map(partial(shards.gather, axis=1), ended)
         metrics[episodes.KEY] = episodes.pack(every, episodes.room(config))
-    every = _every_source(state.arenas, waiting)
-    if every is not None:
-        arenas, curriculum, told = _practise(program, every, arenas, batch, ended, curriculum)
-        metrics |= told
     new = TrainState(
         learners=learners,
         arenas=arenas,
@@ -199,69 +200,18 @@ def _learn(
     )(explored, batch, jax.random.split(key, config.learners))
 
 
-def _every_source(arenas: Arena, waiting: Arena) -> LevelSource | None:
-    """Lists the level sources of a rollout's episodes, [J, A]; None without a buffer of levels."""
-    if arenas.source is None or waiting.source is None:
-        return None
-    return practice.line_up(arenas.source, waiting.source)
-
-
-def _practise(
-    program: Program,
-    every: LevelSource,
-    arenas: Arena,
-    batch: Batch,
-    ended: Ended,
-    curriculum: Curriculum,
-) -> tuple[Arena, Curriculum, Metrics]:
-    """Adds the episodes of a rollout to the buffer of levels."""
-    config, source, loss = program.config.curriculum, arenas.source, None
-    assert curriculum.levels is not None
-    assert source is not None
-    if every.gained is not None:
-        before = jax.tree.map(lambda x: x[0], every.gained)
-        loss, gained = practice.gain(before, batch, ended.episodes > 0)
-        source = source._replace(gained=gained)
-    played = practice.together(practice.plays(every, ended, loss, config), program.shards)
-    fast = curriculum.record.fast
-    usual = jnp.where(jnp.isfinite(fast), fast, 0.5)
-    buffer, taken = levels.update(curriculum.levels, played, config.levels, usual)
-    source = source._replace(slot=levels.mark_lost(source.slot, taken))
-    arenas = replace(arenas, source=source)
-    return arenas, replace(curriculum, levels=buffer), levels.describe(buffer, played)
-
-
-def _assigned(program: Program, curriculum: Curriculum) -> Array:
-    """Returns the stage on which the next episode of each arena of this device begins."""
-    return program.shards.local(curricula.assign(curriculum, program.config.arenas))
-
-
-def _draw_first(program: Program, schedule: Schedule, curriculum: Curriculum, key: Array) -> Arena:
-    """Draws the first episode of each arena of this device."""
-    return _draw(program, schedule, curriculum, key, waiting=1)
-
-
-def _draw_waiting(
-    program: Program, schedule: Schedule, curriculum: Curriculum, key: Array
-) -> Arena:
-    """Draws the waiting episodes for the arenas of this device, before a rollout."""
-    return _draw(program, schedule, curriculum, key, waiting=program.config.waiting)
-
-
 def _draw(
-    program: Program, schedule: Schedule, curriculum: Curriculum, key: Array, *, waiting: int
+    program: Program, schedule: Schedule, curriculum: CurriculumState, key: Array, *, waiting: int
 ) -> Arena:
     """Draws `waiting` episodes for each arena of this device."""
-    config = program.config
+    config, shards = program.config, program.shards
+    choose_key = jax.random.fold_in(key, 1)
+    chosen = curricula.choose(
+        program.curriculum(schedule), curriculum, choose_key, (waiting, config.arenas)
+    )
+    following, cohort = jax.tree.map(partial(shards.local, axis=1), chosen)
     return rollout.draw_starts(
-        program.world,
-        schedule.stages,
-        jnp.tile(_assigned(program, curriculum), (waiting, 1)),
-        curriculum.cohort,
-        key,
-        program.shards,
-        config.algo,
-        practice.of(curriculum.levels, schedule.levels, config.curriculum),
+        program.world, schedule.stages, following, cohort, key, shards, config.algo
     )
 
 
@@ -270,22 +220,23 @@ def _mix(stage: Array, stages: int) -> Array:
     return jnp.sum(stage == jnp.arange(stages)[:, None], axis=-1, dtype=jnp.int32)
 
 
-def _curriculum_metrics(before: Curriculum, after: Curriculum, decision: Decision) -> Metrics:
+def _curriculum_metrics(
+    config: ProgramConfig, before: CurriculumState, after: CurriculumState
+) -> Metrics:
     """Reports the decision, the weights that it set or held, and the record of each stage."""
-    record = after.record
+    record, stage = after.cohorts.record, before.chosen.stage
     return {
-        "decision": decision.reason,
-        "decided_stage": decision.stage,
-        "next_stage": decision.next_stage,
-        "stage_success": decision.success,
-        "weights": after.weights,
+        "decision": after.chosen.reason,
+        "decided_stage": stage,
+        "next_stage": after.chosen.stage,
+        "stage_success": record.deciding(config.curriculum.success)[stage],
+        "weights": after.chosen.weights,
         "episodes_by_stage": record.episodes,
         "success_by_stage": record.success,
         "complete_by_stage": record.complete,
         "contacts_by_stage": record.contacts,
         "return_by_stage": record.reward,
         "estimate_by_stage": record.fast,
-        "progress_by_stage": record.progress,
     }
 
 

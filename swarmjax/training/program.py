@@ -6,8 +6,9 @@ import jax
 
 from swarmjax import extension
 from swarmjax.curriculum import engine as curricula
-from swarmjax.curriculum.engine import Mode, Schedule
-from swarmjax.curriculum.modes import MODES
+from swarmjax.curriculum import levels
+from swarmjax.curriculum import stages as stage_modes
+from swarmjax.curriculum.engine import Curriculum, Schedule
 from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.provenance import cores
@@ -15,7 +16,7 @@ from swarmjax.shards import Shards
 from swarmjax.sim import drive
 from swarmjax.task import env, surroundings
 from swarmjax.task.env import World
-from swarmjax.training import episodes, practice
+from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 
 ACTION_SIZE = drive.COMMAND_SIZE  # size of the action if robots broadcast nothing
@@ -56,10 +57,13 @@ class Program[C: ProgramConfig]:
         """Count of numbers that a critic sees in addition to the observation, P; 0 if none."""
         return _state_size(self.config)
 
-    @property
-    def mode(self) -> Mode:
-        """How the curriculum decides."""
-        return MODES[self.config.curriculum.mode]
+    def curriculum(self, schedule: Schedule) -> Curriculum:
+        """Returns the curriculum with the numbers of a schedule."""
+        options = self.config.curriculum
+        by_stage = stage_modes.make(schedule, options)
+        if options.levels.mode == "random":
+            return by_stage
+        return levels.make(by_stage, schedule, options)
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
@@ -105,12 +109,8 @@ def load_world(config: ProgramConfig) -> World:
 
 
 def schedule(config: ProgramConfig) -> Schedule:
-    """Computes the curriculum's numbers.
-
-    Raises:
-      ConfigError: the config mutates levels, but nothing in them can move.
-    """
-    found = curricula.schedule(
+    """Computes the curriculum's numbers."""
+    return curricula.schedule(
         config.stage,
         config.curriculum,
         updates=config.updates,
@@ -118,7 +118,6 @@ def schedule(config: ProgramConfig) -> Schedule:
         rollout=config.algo.rollout_length,
         drawings=extension.load(config.extensions).levels,
     )
-    return found._replace(levels=practice.numbers(config))
 
 
 def groups(config: ProgramConfig, cores: int) -> int:

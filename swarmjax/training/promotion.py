@@ -7,46 +7,42 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from swarmjax.curriculum.engine import BY_BUDGET, BY_THRESHOLD, CurriculumState
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.training.config import ProgramConfig
 
 
 def carry_over(
-    learners: LearnerState, config: ProgramConfig, before: Array, after: Array, promoted: Array
+    learners: LearnerState, config: ProgramConfig, before: CurriculumState, after: CurriculumState
 ) -> LearnerState:
     """Prepares the learners for the stage that begins with a promotion.
 
-    If each robot has a learner and the swarm grows beyond its largest size so far, `newcomers=copy`
-    lets the new robots copy the others' learners in turn: parameters, optimiser and normaliser.
-    Without `copy` the new robots begin untrained. Then the optimiser, the normaliser and the
-    exploration of all learners are reset or kept, as `config.curriculum` says. Keeping these three
-    has no cost.
+    If each robot has a learner and the swarm grows beyond its largest size so far, the new robots
+    copy the others' learners in turn: parameters, optimiser and normaliser. Then the optimiser and
+    the exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has
+    no cost.
 
     Args:
       learners: [L].
       config: settings of the run.
-      before: [] most robots of any stage so far, at least 1.
-      after: [] most robots of any stage, including the one that begins.
-      promoted: [] whether there was a promotion; otherwise the learners stay unchanged.
+      before: state of the curriculum before the update.
+      after: and after it. Without a promotion, the learners stay unchanged.
 
     Returns:
       The learners, [L].
     """
     options, carried = config.curriculum, learners
-    if options.newcomers == "copy" and config.learners > 1:
-        carried = _copied(carried, before, after)
+    if config.learners > 1:
+        carried = _copied(carried, before.met, after.met)
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
-    if options.normalizer == "relearn":
-        # The old moments normalise the next batch. With a count of 0, that batch's moments then
-        # replace them.
-        unweighted = replace(carried.normalizer, count=jnp.zeros_like(carried.normalizer.count))
-        carried = replace(carried, normalizer=unweighted)
     if options.exploration == "reset":
         carried = ppo.explore_anew(carried, config.algo)
     if carried is learners:
         return learners
+    reason = after.chosen.reason
+    promoted = (reason == BY_THRESHOLD) | (reason == BY_BUDGET)
     return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
 
 

@@ -6,14 +6,16 @@ with N the robots of an arena that one learner drives.
 
 import functools
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.ppo import gae, monte_carlo, team
+from swarmjax.curriculum.cohorts import UNCOUNTED
+from swarmjax.curriculum.engine import Next
+from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
@@ -26,13 +28,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
-from swarmjax.training import practice as practices
-from swarmjax.training.practice import LevelSource, Practice
 from swarmjax.training.program import Program
-
-# Cohort of an episode that does not count. The curriculum's cohorts have numbers from 0, and -1 is
-# the cohort before the first.
-UNCOUNTED = -2
 
 
 @struct.dataclass
@@ -44,13 +40,13 @@ class Arena(EnvState):
       cohort: [] the curriculum's cohort in which the episode began, int32.
       recall: [R, H] memory of each robot's actor and critic before the observation; None without a
         memory.
-      source: the episode's level source; None without a curriculum over levels.
+      seed: [] seed of the episode's level, uint32; None if the curriculum chooses no levels.
     """
 
     stage: Array
     cohort: Array
     recall: Recall | None = None
-    source: LevelSource | None = None
+    seed: Array | None = None
 
 
 class Trajectory(NamedTuple):
@@ -62,7 +58,7 @@ class Trajectory(NamedTuple):
       log_prob: of the action.
       value: of the observation.
       next_value: value of the observation after the step, before any reset.
-      reward: of the step, shared by the team with `algo.team_reward`.
+      reward: of the step.
       terminated: whether the robot arrived in this step; with `task.arrival=hold`, whether all
         robots were on their targets at once.
       truncated: whether the time ran out for the robot.
@@ -116,14 +112,13 @@ def to_arenas(x: Array) -> Array:
 def draw_starts(
     world: World,
     stages: Stage,
-    index: Array,
+    following: Next,
     cohort: Array,
     key: Array,
     shards: Shards = ALONE,
     config: AlgoConfig | None = None,
-    practice: Practice | None = None,
 ) -> Arena:
-    """Draws new levels for episodes that wait until their arena is free.
+    """Draws the levels of episodes that wait until their arena is free.
 
     They are drawn before a rollout, `config.waiting` for each arena, and not at every step. An
     arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
@@ -132,40 +127,37 @@ def draw_starts(
     Args:
       world: the compiled environment.
       stages: [S].
-      index: [W, A] stage of each episode: the first episode of every arena, then the second, and so
-        on.
-      cohort: [] cohort of the curriculum.
-      key: random key, consumed.
+      following: [W, A] the episodes: the first episode of every arena, then the second, and so on.
+      cohort: [W, A] or [] cohort for which each episode counts, int32.
+      key: random key for the new levels, consumed.
       shards: how the arenas are spread over devices; A counts those of this device.
       config: whether robots have a memory; None: they have none.
-      practice: inputs of the curriculum over levels; None: every level is new.
 
     Returns:
       [W A] waiting episodes, packed.
     """
     memory = None if config is None else begin_memory(config, (world.spacing.robots,))
-    waiting, arenas = index.shape
-    size = (waiting, arenas // shards.local_streams, level.uniform_count(world.spacing))
-    uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
+    waiting, arenas = following.stage.shape
+    count = level.uniform_count(world.spacing)
     stages = jax.tree.map(jnp.asarray, stages)
-    source = None
-    if practice is not None:
-        deal_key = jax.random.fold_in(key, 1)
-        source = practices.deal(practice, uniforms, index, deal_key, shards, world.spacing)
-        uniforms = source.numbers
+    if following.level is None:
+        size = (waiting, arenas // shards.local_streams, count)
+        uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
+    else:
+        uniforms = jax.vmap(lambda seed: jax.random.uniform(jax.random.key(seed), (count,)))(
+            following.level.ravel()
+        )
 
-    def start(uniform: Array, i: Array) -> Arena:
+    def start(uniform: Array, i: Array, cohort: Array, seed: Array | None) -> Arena:
         stage = task_stage.select(stages, i)
         drawn = extended.draw(uniform, stage, world.spacing, world.drawings)
         begun = vars(env.reset(world, drawn))
-        at = i.astype(jnp.int32), jnp.asarray(cohort, jnp.int32)
-        return Arena(**begun, stage=at[0], cohort=at[1], recall=memory)
+        return Arena(**begun, stage=i, cohort=cohort, recall=memory, seed=seed)
 
-    starts = jax.vmap(start)(uniforms.reshape(-1, uniforms.shape[-1]), index.ravel())
-    if source is None:
-        return starts
-    counted = jnp.where(practices.is_fresh(source), starts.cohort, UNCOUNTED)
-    return replace(starts, cohort=counted, source=source)
+    seed = None if following.level is None else following.level.ravel()
+    index = following.stage.astype(jnp.int32).ravel()
+    cohorts = jnp.broadcast_to(cohort, following.stage.shape).ravel()
+    return jax.vmap(start)(uniforms.reshape(-1, count), index, cohorts, seed)
 
 
 def collect(
@@ -183,9 +175,8 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    config, under_way = program.config.algo, arenas.source
-    arenas, waiting = replace(arenas, source=None), replace(starts, source=None)
-    waits = _Waiting(waiting, _judge(program, learners, waiting))
+    config = program.config.algo
+    waits = _Waiting(starts, _judge(program, learners, starts))
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
@@ -194,10 +185,7 @@ def collect(
     steps = config.rollout_length
     keys = jax.random.split(key, steps)
     carry, (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
-    arenas, _, begun = carry
-    if under_way is not None and starts.source is not None:
-        every = practices.line_up(under_way, starts.source)
-        arenas = replace(arenas, source=practices.current(every, begun))
+    arenas = carry[0]
     packed = jax.vmap(physics.pack)(arenas.sim)
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
@@ -248,6 +236,33 @@ def batch(
     first = jax.tree.map(lambda x: to_learners(x, over.shape[1]), memory)
     begins = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
     return replace(found, memory=first, begins=group(begins))
+
+
+def value_loss(batch: Batch, ended: Ended) -> Array:
+    """Computes the positive value loss of each episode, over its transitions in a rollout.
+
+    Args:
+      batch: [L] batches, each of A groups with T N samples.
+      ended: [T, A] episodes that ended.
+
+    Returns:
+      [T, A] mean of max(advantage, 0) over the transitions since the last end of an episode.
+    """
+    steps = ended.episodes.shape[0]
+
+    def by_step(x: Array) -> Array:
+        return jnp.sum(x.reshape(*x.shape[:2], steps, -1), axis=(0, 3)).T
+
+    positive = by_step(jnp.where(batch.valid, jnp.maximum(batch.advantage, 0.0), 0.0))
+    valid = by_step(batch.valid.astype(jnp.float32))
+
+    def step(sums: tuple[Array, Array], now: tuple[Array, Array, Array]) -> Any:
+        total, count = sums[0] + now[0], sums[1] + now[1]
+        going_on = jnp.where(now[2], 0.0, total), jnp.where(now[2], 0.0, count)
+        return going_on, total / jnp.maximum(count, 1.0)
+
+    none = jnp.zeros_like(positive[0])
+    return jax.lax.scan(step, (none, none), (positive, valid, ended.episodes > 0))[1]
 
 
 def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tuple[Array, Array]:
@@ -319,7 +334,7 @@ _COUNTS = {
     "broken": 1,
 }
 
-_Counts = tuple[Array, Array, Robots | None]  # counts [A, K], rewards [A], robots
+_Counts = tuple[Array, Ended]  # counts [A, K]; the other results [A]
 _Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
 
 
@@ -342,7 +357,6 @@ def _step(
     if memory is not None and judged.memory is not None:
         arenas = replace(arenas, recall=Recall(memory, to_arenas(judged.memory)))
     reached = _judge(program, learners, arenas)
-    reward = _shared(config, arenas, came, to_arenas(reached.value))
     ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, first = _next(waits, begun)
     arenas = restart(arenas, starts, came.done)
@@ -353,7 +367,7 @@ def _step(
         log_prob=log_prob,
         value=judged.value,
         next_value=reached.value,
-        reward=to_learners(reward, count),
+        reward=to_learners(came.reward, count),
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
@@ -362,26 +376,6 @@ def _step(
     )
     carry = (arenas, _pick(over, first, reached), begun + came.done)
     return carry, (transition, _to_counts(ended))
-
-
-def _shared(config: AlgoConfig, arenas: Arena, came: env.TimeStep, value: Array) -> Array:
-    """Returns the rewards to learn from, [A, R].
-
-    Args:
-      config: settings of the algorithm.
-      arenas: [A] after the step, before any reset.
-      came: [A] results of the step.
-      value: [A, R] values after the step.
-    """
-    part = config.team_reward
-    if not part:
-        return came.reward
-    present = arenas.level.present
-    later = team.still_paid(value, present & ~arenas.arrived, present, part)
-    if config.time_out == "terminal":  # then the returns of the others end here too
-        later = jnp.where(came.done[:, None], 0.0, later)
-    last = jnp.where(came.terminated, config.discount * later, 0.0)
-    return team.share(came.reward, present, part) + last
 
 
 def _act(
@@ -480,6 +474,7 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
         contacts=mine(jnp.sum(episode.contacts, axis=-2)),
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~came.sound).astype(jnp.int32),
+        level=None if arenas.seed is None else mine(arenas.seed),
         robots=jax.tree.map(mine, _robots(arenas)) if by_robot else None,
     )
 
@@ -487,16 +482,17 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
 def _to_counts(ended: Ended) -> _Counts:
     """Lays the counts [A, ...] of a step side by side [A, K], to write one array instead of 11."""
     columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
-    return jnp.concatenate(columns, axis=1), ended.reward, ended.robots
+    rest = ended._replace(**dict.fromkeys(_COUNTS))
+    return jnp.concatenate(columns, axis=1), rest
 
 
-def _to_ended(counts: Array, reward: Array, robots: Robots | None) -> Ended:
+def _to_ended(counts: Array, rest: Ended) -> Ended:
     """Undoes `_to_counts` for all steps of a rollout, [T, A, ...]."""
-    found, first = {}, 0
+    columns, first = {}, 0
     for name, width in _COUNTS.items():
-        found[name] = counts[..., first] if width == 1 else counts[..., first : first + width]
+        columns[name] = counts[..., first] if width == 1 else counts[..., first : first + width]
         first += width
-    return Ended(**found, reward=reward, robots=robots)
+    return rest._replace(**columns)
 
 
 def _robots(arenas: EnvState) -> Robots:

@@ -171,7 +171,4 @@ def figures(history: History) -> dict[str, bytes]:
     made = report_figures.by_stage(history)
     if len(history.names) > 1:
         made["mix"] = report_figures.mix(history, report_figures.SMALL)
-    levels = report_figures.levels(history)
-    if levels is not None:
-        made["levels"] = levels
     return {name: drawing.png(figure) for name, figure in made.items()}

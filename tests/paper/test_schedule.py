@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.engine import Next, Schedule
 from swarmjax.ppo import exploration
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -87,13 +87,13 @@ def _drive(config: TrainConfig, updates: int) -> dict[str, np.ndarray]:
 
 
 def _round(
-    program: Program, schedule: curriculum.Schedule, state: TrainState, _: None
+    program: Program, schedule: Schedule, state: TrainState, _: None
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Runs one rollout as `loop.update` does; returns the data that reveal its deviation."""
     config, world = program.config, program.world
     key, level_key, rollout_key = jax.random.split(state.key, 3)
     index = jnp.zeros((config.waiting, 1), jnp.int32)
-    starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
+    starts = rollout.draw_starts(world, schedule.stages, Next(index), jnp.int32(0), level_key)
     arenas, path, ended = rollout.collect(
         program, state.learners, state.arenas, starts, rollout_key
     )

@@ -110,14 +110,14 @@ def test_promotions_are_tabled_and_reweighings_summed_up(tmp_path: Path) -> None
     weights = {f"n{i}": i / 100 for i in range(10)} | {"none": None}
     decisions = [
         {"seed": 1, "update": 3, **moved},
-        {"seed": 0, "update": 5, "from": "trio", "to": "pair", "why": "demotion"},
+        {"seed": 0, "update": 5, "from": "trio", "to": "pair", "why": "budget"},
         {"seed": 0, "update": 7, "why": "reweighed", "weights": {"n0": 1.0}},
         {"seed": 0, "update": 9, "why": "reweighed", "weights": weights},
     ]
     rows = _page(_history(tmp_path, [row(0)], decisions)).rows
     # An update is 64 arena control steps.
     assert ["1", "4", "256", "pair", "trio", "threshold", "87.5 %", "75.0 %"] in rows
-    assert ["0", "6", "384", "trio", "pair", "demotion", "-", "-"] in rows
+    assert ["0", "6", "384", "trio", "pair", "budget", "-", "-"] in rows
     assert ["0", "2", "10", "n9 9.0 %, n8 8.0 %, n7 7.0 %, n6 6.0 %, n5 5.0 %"] in rows
 
 

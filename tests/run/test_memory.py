@@ -11,7 +11,6 @@ import pytest
 
 from swarmjax import train
 from swarmjax.config import ConfigError
-from swarmjax.curriculum.config import CurriculumConfig, LevelsConfig
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import execute, lifecycle, memory, trainer
 from swarmjax.run.load_settings import load_run, load_train
@@ -51,19 +50,6 @@ def test_a_cpu_has_all_the_memory_of_its_computer() -> None:
     found = re.search(r"MemTotal: +(\d+) kB", Path("/proc/meminfo").read_text())
     assert found is not None
     assert memory.limit() == int(found[1]) * 1024
-
-
-def test_a_buffer_of_levels_larger_than_the_memory_is_refused() -> None:
-    levels = LevelsConfig(mode="learnability", buffer=1000)
-    settings = replace(SETTINGS, curriculum=CurriculumConfig(levels=levels), seeds=2)
-    memory.check_buffer(settings, 2 * GIB, 2 * GIB)
-    memory.check_buffer(settings, 4 * GIB, None)
-    with pytest.raises(ConfigError) as error:
-        memory.check_buffer(settings, 4 * GIB, GIB)
-    assert str(error.value) == (
-        "curriculum.levels.buffer is 1000 for each of 2 seeds, which needs 4 GiB of memory, and "
-        "there is 1 GiB: give less than 250, or train on a device with more."
-    )
 
 
 # The choice

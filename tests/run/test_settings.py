@@ -206,21 +206,16 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=s6", "stage.side=[0.7,1.2]"], "stage.side is [0.7,1.2], too small for robots=5, "
          "obstacles=3, obstacle_size=0.1: give at least 0.77."),
         # Options of a mode.
-        (["curriculum.score=learnability"], "curriculum.score is learnability, but mode is "
-         "mixed: score is an option of adaptive, so give null or mode=adaptive."),
-        (["curriculum.mode=mixed", "curriculum.floor=0.1"], "curriculum.floor is 0.1, but mode is "
-         "mixed: floor is an option of adaptive, so give null or mode=adaptive."),
+        (["curriculum.score=failure"], "curriculum.score is failure, but mode is mixed: score is "
+         "an option of adaptive, so give learnability or mode=adaptive."),
+        (["curriculum.mode=mixed", "curriculum.floor=0.2"], "curriculum.floor is 0.2, but mode is "
+         "mixed: floor is an option of adaptive, so give 0.1 or mode=adaptive."),
         (["curriculum.mode=sequential", "curriculum.earlier_share=0.1"], "curriculum.earlier_share "
-         "is 0.1, but mode is sequential: earlier_share is an option of mixed, so give null or "
+         "is 0.1, but mode is sequential: earlier_share is an option of mixed, so give 0.2 or "
          "mode=mixed."),
-        (["curriculum.mode=adaptive", "curriculum.threshold=0.8"], "curriculum.threshold is 0.8, "
-         "but mode is adaptive: threshold is an option of sequential and mixed and adaptive with "
-         "prerequisites, so give null or mode=sequential."),
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
          "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
          "keep or mode=sequential."),
-        (["curriculum.demotion=0.8"], "curriculum.demotion is 0.8, but threshold is 0.8: give "
-         "less than 0.8."),
         # Grids.
         (["stage=grid", "stage.side=1"], "stage.side cannot be given for grid, a grid: give its "
          "axes, as in stage.grid.side=[0.7,1.0]."),
@@ -250,10 +245,6 @@ def test_import_needs_neither_jax_nor_hydra():
          "choose one, task.history=1 or algo.memory=none."),
         (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
          "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
-        (["algo.team_reward=0.5", "algo.advantage=monte_carlo"],
-         "algo.team_reward is 0.5, but algo.advantage is monte_carlo and task.arrival is latch, so "
-         "returns end at a robot's arrival: give algo.advantage=gae, task.arrival=hold or "
-         "algo.team_reward=0."),
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
         (["task.neighbours.count=2", "task.history=3"], "task.history is 3, but neighbours.count "
          "is 2: choose one, history=1 or neighbours.count=0; neighbours work with "
@@ -352,26 +343,6 @@ def test_a_training_without_stages_is_refused():
 
 
 # Curricula
-
-
-def test_options_hold_their_defaults_in_their_own_mode():
-    def options(*words):
-        made = load_train([f"curriculum.{word}" for word in words])
-        # A stored configuration is read back unchanged.
-        assert build(TrainConfig, to_dict(made)) == made
-        return made.curriculum
-
-    names = ("threshold", "demotion", "budget_share", "earlier_share", "score", "floor")
-    expected = {
-        "sequential": (0.8, None, 0.5, None, None, None),
-        "mixed": (0.8, None, 0.5, 0.2, None, None),
-        "adaptive": (None, None, None, None, "learnability", 0.1),
-    }
-    for mode, values in expected.items():
-        found = options(f"mode={mode}")
-        assert tuple(getattr(found, name) for name in names) == values
-    assert options("threshold=null", "demotion=0.2").demotion == 0.2
-    assert options("mode=adaptive", "score=progress").score == "progress"
 
 
 def test_a_side_may_be_a_range():

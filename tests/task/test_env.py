@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from entries import BEARING, DISTANCE, INFRARED, KNOWN
 
+from swarmjax.curriculum.engine import Next
 from swarmjax.run.load_settings import load_train
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
@@ -518,7 +519,7 @@ def real() -> Drawn:
     config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
     world, stages = programs.load_world(config), task_stage.stack(config.stage)
     draw = jax.jit(
-        functools.partial(rollout.draw_starts, world, stages, np.zeros((1, FEW), np.int32))
+        functools.partial(rollout.draw_starts, world, stages, Next(jnp.zeros((1, FEW), jnp.int32)))
     )
     starts = [draw(jnp.int32(cohort), jax.random.key(cohort)) for cohort in range(2)]
     traces = []

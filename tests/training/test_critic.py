@@ -58,7 +58,7 @@ def trained(tiny_config: TrainConfig) -> Trained:
         last = chunk(schedule, last, np.int32(1))[0]
     at_once, _ = chunk(schedule, first, np.int32(UPDATES))
     assert digest(to_leaves(at_once)) == digest(to_leaves(last))  # any chunk size
-    waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
+    waiting = loop._draw(program, schedule, last.curriculum, jax.random.key(1), waiting=1)
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))

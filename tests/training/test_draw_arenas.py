@@ -26,10 +26,13 @@ def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, Tra
     begun = jax.jit(partial(loop.init, program))(schedule)
     remembered = jax.tree.map(lambda x: x + 1.0, begun.arenas.recall)
     begun = replace(begun, arenas=replace(begun.arenas, recall=remembered))
-    weights = np.float32([0.0, 1.0])
-    tally = jax.tree.map(lambda x: x + 3, begun.curriculum.current)
+    cohorts, own = begun.curriculum.cohorts, begun.curriculum.own
+    tally = jax.tree.map(lambda x: x + 3, cohorts.current)
+    chosen = own.chosen._replace(stage=np.int32(1), weights=np.float32([0.0, 1.0]))
     there = replace(
-        begun.curriculum, stage=np.int32(1), weights=weights, age=np.int32(1), current=tally
+        begun.curriculum,
+        cohorts=replace(cohorts, age=np.int32(1), current=tally),
+        own=replace(own, chosen=chosen),
     )
     before = replace(begun, curriculum=there)
     without: Any = replace(before, arenas=None)
@@ -43,11 +46,11 @@ def test_learners_and_updates_stay(states: tuple[TrainState, TrainState]) -> Non
             np.testing.assert_array_equal(after[name], before[name], err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["stage", "weights", "since", "record", "met"])
-def test_what_the_curriculum_has_decided_stays(
-    name: str, states: tuple[TrainState, TrainState]
-) -> None:
-    before, after = (getattr(state.curriculum, name) for state in states)
+def test_what_the_curriculum_has_decided_stays(states: tuple[TrainState, TrainState]) -> None:
+    before, after = (
+        (state.curriculum.own, state.curriculum.cohorts.record, state.curriculum.met)
+        for state in states
+    )
     jax.tree.map(np.testing.assert_array_equal, after, before)
 
 
@@ -65,14 +68,14 @@ def test_arenas_begin_with_nothing_to_remember(states: tuple[TrainState, TrainSt
 
 def test_a_cohort_begins_that_holds_all_new_episodes(states: tuple[TrainState, TrainState]) -> None:
     before, after = states
-    assert int(after.curriculum.cohort) == int(before.curriculum.cohort) + 1
-    assert int(after.curriculum.age) == 0
-    assert set(after.arenas.cohort.tolist()) == {int(after.curriculum.cohort)}
+    assert int(after.curriculum.cohorts.number) == int(before.curriculum.cohorts.number) + 1
+    assert int(after.curriculum.cohorts.age) == 0
+    assert set(after.arenas.cohort.tolist()) == {int(after.curriculum.cohorts.number)}
 
 
 def test_episodes_that_were_lost_are_not_counted(states: tuple[TrainState, TrainState]) -> None:
-    curriculum = states[1].curriculum
-    for tally in (curriculum.current, curriculum.previous):
+    cohorts = states[1].curriculum.cohorts
+    for tally in (cohorts.current, cohorts.previous):
         assert [int(np.sum(x)) for x in tally] == [0] * len(tally)
 
 

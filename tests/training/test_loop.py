@@ -87,6 +87,7 @@ def test_levels_noise_and_shuffles_are_drawn_by_keys_of_their_own(
     program: Program, start: Callable[[], TrainState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     keys = []
+    state = start()
 
     def taken(*arguments: Any, **_: Any) -> Any:
         """Keeps the key, which is the last argument of each of the three."""
@@ -95,11 +96,10 @@ def test_levels_noise_and_shuffles_are_drawn_by_keys_of_their_own(
             raise StopIteration
         return None, None, None
 
-    monkeypatch.setattr(loop, "_draw_waiting", taken)
+    monkeypatch.setattr(loop, "_draw", taken)
     monkeypatch.setattr(rollout, "collect", taken)
     monkeypatch.setattr(rollout, "batch", lambda *_: None)
     monkeypatch.setattr(loop, "_learn", taken)
-    state = start()
     with pytest.raises(StopIteration):
         loop.update(program, programs.schedule(program.config), state)
     keys.append(tuple(jax.random.key_data(state.key).tolist()))
@@ -179,7 +179,6 @@ def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: Trai
     # Other numbers throughout the schedule need no second trace.
     other = schedule._replace(
         threshold=np.float32(0.1),
-        demotion=np.float32(0.05),
         earlier_share=np.float32(0.9),
         cohort_updates=np.int32(3),
         deadline=np.arange(1, 7, dtype=np.int32),
@@ -212,7 +211,7 @@ def test_metrics_by_stage_are_the_record(
     program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
     state, metrics = chunk(programs.schedule(program.config), start(), np.int32(20))
-    record = state.curriculum.record
+    record = state.curriculum.cohorts.record
     names = {
         "episodes_by_stage": record.episodes,
         "success_by_stage": record.success,
@@ -220,8 +219,7 @@ def test_metrics_by_stage_are_the_record(
         "contacts_by_stage": record.contacts,
         "return_by_stage": record.reward,
         "estimate_by_stage": record.fast,
-        "progress_by_stage": record.progress,
-        "weights": state.curriculum.weights,
+        "weights": state.curriculum.chosen.weights,
     }
     for name, expected in names.items():
         np.testing.assert_array_equal(metrics[name][19], expected, err_msg=name)

@@ -57,7 +57,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     at_once, _ = chunk(schedule, states[0], np.int32(UPDATES))
     assert digest(to_leaves(at_once)) == digest(to_leaves(states[-1]))  # any chunk size
     last = states[-1]
-    waiting = loop._draw_waiting(program, schedule, last.curriculum, jax.random.key(1))
+    waiting = loop._draw(program, schedule, last.curriculum, jax.random.key(1), waiting=1)
     collect = jax.jit(partial(rollout.collect, program))
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
@@ -125,7 +125,7 @@ def stacked(tiny_config: TrainConfig, tiny_world: World) -> Seen:
     program = Program(replace(tiny_config, task=task), world)
     schedule = programs.schedule(program.config)
     first = jax.jit(partial(loop.init, program))(schedule)
-    waiting = loop._draw_waiting(program, schedule, first.curriculum, jax.random.key(1))
+    waiting = loop._draw(program, schedule, first.curriculum, jax.random.key(1), waiting=1)
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(first.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))

@@ -9,12 +9,13 @@ import numpy as np
 import optax
 import pytest
 
+from swarmjax.curriculum import engine, stages
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.settings import TrainConfig
+from swarmjax.training import program as programs
 from swarmjax.training import promotion
 
 LEARNERS, OBSERVED = 5, 3
@@ -64,9 +65,14 @@ def _promote(
     promoted: bool = True,
     **options: Any,
 ) -> LearnerState:
-    chosen = replace(config, curriculum=CurriculumConfig(**options))
+    chosen = replace(config, curriculum=CurriculumConfig(mode="sequential", **options))
+    schedule = programs.schedule(chosen)
+    state = engine.init(stages.make(schedule, chosen.curriculum), schedule)
+    reason = jnp.int32(engine.BY_THRESHOLD if promoted else engine.STAYED)
+    now = replace(state.own, chosen=state.chosen._replace(reason=reason))
+    met = jnp.int32(before), jnp.int32(after)
     return promotion.carry_over(
-        learners, chosen, jnp.int32(before), jnp.int32(after), jnp.array(promoted)
+        learners, chosen, replace(state, met=met[0]), replace(state, own=now, met=met[1])
     )
 
 
@@ -74,7 +80,7 @@ def _assert_same(found: Any, expected: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
-RESET = {"optimizer": "reset", "normalizer": "relearn", "exploration": "reset"}
+RESET = {"optimizer": "reset", "exploration": "reset"}
 
 
 def test_newcomers_take_over_in_turn(config: TrainConfig, learners: LearnerState) -> None:
@@ -92,11 +98,6 @@ def test_only_those_come_that_the_swarm_grows_by(
     found = _promote(learners, config, before=3, after=4)
     _assert_same(found, jax.tree.map(lambda x: x[np.array([0, 1, 2, 0, 4])], learners))
     _assert_same(_promote(learners, config, before=3, after=3), learners)
-
-
-def test_fresh_newcomers_stay_as_they_are(config: TrainConfig, learners: LearnerState) -> None:
-    found = _promote(learners, config, before=2, after=5, newcomers="fresh")
-    assert found is learners
 
 
 def test_what_is_kept_costs_nothing(config: TrainConfig, learners: LearnerState) -> None:
@@ -129,22 +130,6 @@ def test_optimizer(config: TrainConfig, learners: LearnerState) -> None:
     assert [rate.count.tolist() for rate in rates] == [[2] * LEARNERS] * 2  # gradient steps so far
 
 
-def test_normalizer_forgets_with_the_next_batch(
-    config: TrainConfig, learners: LearnerState
-) -> None:
-    found = _promote(learners, config, normalizer="relearn")
-    _assert_same((found.params, found.optimizer_state), (learners.params, learners.optimizer_state))
-    assert found.normalizer.count.tolist() == [0.0] * LEARNERS
-    _assert_same(found.normalizer.mean, learners.normalizer.mean)
-    _assert_same(found.normalizer.variance, learners.normalizer.variance)
-    seen = np.array([[1.0, 2.0, 30.0], [3.0, 2.0, 10.0]], np.float32)
-    one = jax.tree.map(lambda x: x[0], found.normalizer)
-    after = normalizer.update(one, jnp.asarray(seen), jnp.ones(2, bool))
-    # The moments are those of the batch alone, up to float32 rounding of the old means.
-    np.testing.assert_allclose(after.mean, [2.0, 2.0, 20.0], rtol=1e-6)
-    np.testing.assert_allclose(after.variance, [1.0, 0.0, 100.0], rtol=1e-6, atol=1e-6)
-
-
 def test_exploration(config: TrainConfig, learners: LearnerState) -> None:
     before = learners.params["actor"]["log_std"]
     assert np.abs(np.exp(before) - 0.5).max() > 1e-4  # it has moved
@@ -161,5 +146,4 @@ def test_newcomers_are_reset_like_the_others(config: TrainConfig, learners: Lear
     _assert_same(
         found.params["critic"]["torso"]["hidden_0"]["kernel"], kernel[np.array([0, 1, 0, 1, 4])]
     )
-    assert not found.normalizer.count.any()
     np.testing.assert_allclose(np.exp(found.params["actor"]["log_std"]), 0.5, rtol=1e-6)  # float32

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from entries import DISTANCE, INFRARED
 
+from swarmjax.curriculum.cohorts import UNCOUNTED
+from swarmjax.curriculum.engine import Next
 from swarmjax.ppo import gae
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
@@ -76,7 +78,7 @@ def learners(tiny_config: TrainConfig) -> LearnerState:
 def draw(tiny_config: TrainConfig, tiny_world: World) -> Draw:
     """Returns a function of a seed and a cohort that draws starts of the two stages in turn."""
     stages, index = task_stage.stack(tiny_config.stage), jnp.arange(ARENAS)[None] % 2
-    draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, index))
+    draw = jax.jit(functools.partial(rollout.draw_starts, tiny_world, stages, Next(index)))
     return lambda seed, cohort: draw(jnp.int32(cohort), jax.random.key(seed))
 
 
@@ -243,50 +245,6 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
         np.testing.assert_allclose(found.return_[learner], normal.T, atol=5e-6)
         advantage = normal - np.asarray(trajectory.value[mine])
         np.testing.assert_allclose(found.advantage[learner], advantage.T, atol=5e-6)
-
-
-# --- shared rewards
-
-
-def _almost_there(before: Arena) -> Arena:
-    """Returns arenas of two robots, where one arrives first, in 6 when the time runs out."""
-    pose, target = before.level.start[:, 0], before.level.target
-    ahead = jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=-1)
-    for arena in (4, 6):
-        target = target.at[arena, 0].set(pose[arena, :2] + 0.0501 * ahead[arena])
-    clock = before.clock.at[6].set(LIMIT - 1)
-    return dataclasses.replace(before, level=before.level._replace(target=target), clock=clock)
-
-
-@pytest.mark.parametrize("time_out", ["bootstrap", "terminal"])
-def test_a_robot_that_arrives_is_paid_its_share_of_what_the_others_still_earn(
-    program: Program, run: Run, time_out: Any
-) -> None:
-    part, discount, before = 0.5, 0.5, _almost_there(run.before)
-
-    def collect(**settings: Any) -> tuple[Trajectory, Ended]:
-        algo = dataclasses.replace(program.config.algo, time_out=time_out, **settings)
-        mine = dataclasses.replace(program, config=dataclasses.replace(program.config, algo=algo))
-        found = jax.jit(functools.partial(rollout.collect, mine))
-        key = jax.random.key(2)
-        return jax.tree.map(np.asarray, found(run.learners, before, run.starts, key)[1:])
-
-    alone, ended = collect()
-    shared, _ = collect(team_reward=part, discount=discount)
-    np.testing.assert_array_equal(shared.action, alone.action)
-    for arena, robots in ((ARRIVES, 3), (4, 2), (6, 2)):
-        pick = np.s_[:, 0, arena, :robots]
-        own, value, used = (x[pick] for x in (alone.reward, alone.next_value, alone.valid))
-        arrives = alone.terminated[pick] & used
-        under_way = used & ~arrives
-        total = (value * under_way).sum(axis=-1) / (1 - part + part * under_way.mean(axis=-1))
-        over = ended.episodes[:, arena].astype(bool) & (time_out == "terminal")
-        last = np.where(over, 0.0, discount * part * total / robots)
-        expected = (1 - part) * own + part * own.mean(axis=-1, keepdims=True)
-        expected += np.where(arrives, last[:, None], 0.0)
-        assert (arrives & under_way.any(axis=-1)[:, None]).any(), "one arrives before another"
-        # 32-bit rounding of sums that are added in another order.
-        np.testing.assert_allclose(shared.reward[pick][used], expected[used], atol=1e-6)
 
 
 # --- episodes that wait
@@ -463,7 +421,7 @@ def test_a_level_counts_once_a_rollout(program: Program, run: Run) -> None:
     starts = dataclasses.replace(run.starts, clock=jnp.full(ARENAS, 13, jnp.int32))
     collect = jax.jit(functools.partial(rollout.collect, program))
     after, _, ended = collect(run.learners, before, starts, jax.random.key(2))
-    uncounted = rollout.UNCOUNTED
+    uncounted = UNCOUNTED
     none = [-1, -1]
     expected = [NOW, *none, NEXT, *none, uncounted, -1]
     for arena in range(ARENAS):
@@ -561,6 +519,7 @@ def test_ended_episodes_add_up(run: Run, replay: Replay) -> None:
                 continue
             found = ended._replace(contacts=ended.contacts.tolist())._asdict()
             assert found.pop("robots") is None  # without run.episodes
+            assert found.pop("level") is None  # without a buffer of levels
             assert found == expected[t]
             contacts += found["contacts"]
     assert contacts.any()

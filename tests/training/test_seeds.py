@@ -154,18 +154,21 @@ def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> 
     counts[:, 0] = 10
     hits = counts * 0
     hits[:, 0] = reached
-    previous = start.curriculum.previous._replace(episodes=counts, targets=counts, reached=hits)
-    before = replace(
-        start.curriculum,
-        cohort=np.full(SEEDS, cohort, np.int32),
+    cohorts = start.curriculum.cohorts
+    previous = cohorts.previous._replace(episodes=counts, targets=counts, reached=hits)
+    own = replace(start.curriculum.own, turn=np.full(SEEDS, cohort, np.int32))
+    late = replace(
+        cohorts,
+        number=np.full(SEEDS, cohort, np.int32),
         age=np.full(SEEDS, 1, np.int32),  # the second of two updates, of 8 steps each
         previous=previous,
     )
+    before = replace(start.curriculum, own=own, cohorts=late)
     state, metrics = run(replace(start, curriculum=before), UPDATES)
     assert np.asarray(metrics["stage"])[:, :UPDATES].tolist() == [[0, 1], [0, 0], [0, 0]]
     np.testing.assert_array_equal(metrics["stage_success"][:, 0], np.float32([1.0, 0.5, 0.0]))
     assert [share >= threshold for share in (1.0, 0.5, 0.0)] == [True, False, False]
-    assert np.asarray(state.curriculum.stage).tolist() == [1, 0, 0]
+    assert np.asarray(state.curriculum.chosen.stage).tolist() == [1, 0, 0]
 
 
 def test_what_is_stepped_together_lies_on_one_axis(

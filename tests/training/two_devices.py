@@ -23,7 +23,6 @@ WORDS = [
     "streams=2",
     "task.step_limit=64",
     "curriculum.threshold=0.02",
-    "curriculum.budget_share=null",
 ]
 
 

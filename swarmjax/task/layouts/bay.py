@@ -88,12 +88,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 BAY = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (
-        ("wall", 2),
-        ("start", robots),
-        ("target", robots),
-        ("aside", 2 * robots),
-    ),
+    uniforms=lambda robots, _: 2 + 4 * robots,
     walls=lambda _: 4,
     reads=("gap", "width", "length"),
     least=_least,

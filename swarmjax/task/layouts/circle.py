@@ -48,7 +48,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 CIRCLE = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("wall", 1),),
+    uniforms=lambda _, __: 1,
     walls=lambda _: 0,
     reads=("radius",),
     least=_least,

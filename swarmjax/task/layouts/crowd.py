@@ -51,7 +51,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 CROWD = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("area", 4), ("target", robots), ("start", robots)),
+    uniforms=lambda robots, _: 4 + 2 * robots,
     walls=lambda _: 0,
     reads=("apart",),
     least=_least,

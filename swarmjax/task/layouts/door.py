@@ -89,7 +89,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 DOOR = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("wall", 2), ("area", 8), ("target", robots), ("start", robots)),
+    uniforms=lambda robots, _: 10 + 2 * robots,
     walls=lambda _: 2,
     reads=("gap", "apart"),
     least=_least,

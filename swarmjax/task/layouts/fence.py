@@ -68,7 +68,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 FENCE = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("wall", 1), ("area", 4), ("target", robots), ("start", robots)),
+    uniforms=lambda robots, _: 5 + 2 * robots,
     walls=lambda _: 1,
     reads=("length",),
     least=_least,

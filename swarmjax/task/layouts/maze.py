@@ -121,11 +121,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 MAZE = ArenaLayout(
     draw=draw,
-    parts=lambda robots, cells: (
-        ("wall", 2 * cells * (cells - 1)),
-        ("room", cells**2),
-        ("aside", 4 * robots),
-    ),
+    uniforms=lambda robots, cells: 2 * cells * (cells - 1) + cells**2 + 4 * robots,
     walls=lambda cells: 2 * cells * (cells - 1),
     reads=(),
     least=_least,

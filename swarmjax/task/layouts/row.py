@@ -67,7 +67,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 ROW = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("wall", 1), ("area", 2), ("start", robots)),
+    uniforms=lambda robots, _: 3 + robots,
     walls=lambda _: 2,
     reads=("gap", "apart"),
     least=_least,

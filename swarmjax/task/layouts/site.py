@@ -97,10 +97,8 @@ class ArenaLayout(NamedTuple):
 
     Attributes:
       draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
-      parts: takes a number of robots and cells, and returns in order the parts of the layout's
-        uniform numbers. For each part, it returns what the part places, and its length. A mutation
-        may change single numbers of `wall`, `room`, `target` and `start`. The other parts are
-        `area` (shift of a lattice's points) and `aside` (offset from the middle of a way).
+      uniforms: takes a number of robots and cells, and returns how many uniform numbers the layout
+        takes.
       walls: takes a number of cells (of a maze), and returns the largest number of walls.
       reads: those `NUMBERS` of a stage that the layout uses.
       least: returns the smallest side and breadth with room for a demand, m.
@@ -109,16 +107,12 @@ class ArenaLayout(NamedTuple):
     """
 
     draw: Callable[[Array, Site, Any], Drawn]
-    parts: Callable[[int, int], Sequence[tuple[str, int]]]
+    uniforms: Callable[[int, int], int]
     walls: Callable[[int], int]
     reads: tuple[str, ...]
     least: Callable[[Demand], tuple[float, float]]
     most_robots: int = 100
     square: bool = False
-
-    def uniforms(self, robots: int, cells: int) -> int:
-        """Returns how many uniform numbers the layout takes for these robots and cells."""
-        return sum(count for _, count in self.parts(robots, cells))
 
 
 def pick(uniform: Array, low: Array, high: Array, xp: Any) -> Array:

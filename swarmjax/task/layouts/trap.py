@@ -78,7 +78,7 @@ def _least(demand: Demand) -> tuple[float, float]:
 
 TRAP = ArenaLayout(
     draw=draw,
-    parts=lambda robots, _: (("wall", 2), ("area", 4), ("target", robots), ("start", robots)),
+    uniforms=lambda robots, _: 6 + 2 * robots,
     walls=lambda _: 3,
     reads=("width", "depth"),
     least=_least,

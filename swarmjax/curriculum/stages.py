@@ -1,0 +1,274 @@
+"""The built-in curricula over stages: `sequential`, `mixed` and `adaptive`.
+
+A mode is one pure function. After each update it gets the newest verdicts and returns the newest
+stage, the share of the arenas on each stage, and the reason. A mode is also called before the first
+update, without verdicts, and then returns where a run begins.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from swarmjax.curriculum import cohorts
+from swarmjax.curriculum.cohorts import CohortVerdict, Record
+from swarmjax.curriculum.config import CurriculumConfig
+from swarmjax.curriculum.engine import (
+    BY_BUDGET,
+    BY_THRESHOLD,
+    REWEIGHED,
+    STAYED,
+    Curriculum,
+    CurriculumOutcomes,
+    Next,
+    Schedule,
+    StageChoice,
+)
+
+_UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
+# The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
+# evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
+_GOLDEN = np.uint32(2654435769)
+
+
+@struct.dataclass(kw_only=True)
+class StagesState:
+    """The state of a mode.
+
+    Attributes:
+      chosen: what is trained now.
+      turn: [] number of cohorts so far, int32.
+      since: [] value of `turn` from which the newest decision holds, int32.
+    """
+
+    chosen: StageChoice
+    turn: Array
+    since: Array
+
+
+Mode = Callable[[StagesState, Schedule, CurriculumConfig, CohortVerdict, Array], StageChoice]
+
+
+def make(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
+    """Makes a curriculum over stages.
+
+    Args:
+      schedule: the curriculum's numbers.
+      options: settings of the curriculum.
+
+    Returns:
+      The curriculum; it chooses no levels.
+    """
+    mode, stages = MODES[options.mode], schedule.deadline.shape[0]
+
+    def init() -> StagesState:
+        zero = jnp.zeros((), jnp.int32)
+        nothing = StageChoice(zero, jnp.zeros(stages), zero)
+        blank = StagesState(chosen=nothing, turn=zero, since=zero)
+        chosen = mode(blank, schedule, options, cohorts.no_verdict(stages), zero - 1)
+        return replace(blank, chosen=chosen)
+
+    def choose(state: StagesState, key: Array, free: tuple[int, int]) -> Next:
+        return Next(jnp.tile(assign(state.chosen.weights, state.turn, free[1]), (free[0], 1)))
+
+    def observe(state: StagesState, outcomes: CurriculumOutcomes) -> StagesState:
+        verdict = outcomes.verdict
+        chosen = mode(state, schedule, options, verdict, outcomes.update)
+        decided = chosen.reason != STAYED
+        turn = state.turn + (verdict.over | decided)
+        since = jnp.where(decided, turn, state.since)
+        return StagesState(chosen=chosen, turn=turn, since=since)
+
+    return Curriculum(init, choose, observe)
+
+
+def assign(weights: Array, turn: Array, arenas: int) -> Array:
+    """Chooses the stage [A] on which the next episode of each arena begins.
+
+    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line. So a
+    stage's weight is its share of the arenas, and also its share of the time. From cohort to
+    cohort, u moves by the golden ratio. If there are few arenas, each arena visits every stage over
+    time. If there are many arenas, most of them stay on their stage. That matters because an arena
+    that moves must wait until its episode ends. If all arenas moved, stages with long episodes
+    would get more than their share.
+
+    Args:
+      weights: [S] share of the arenas on each stage.
+      turn: [] number of cohorts so far.
+      arenas: A.
+
+    Returns:
+      [A] int32, never a stage with weight 0.
+    """
+    turned = turn.astype(jnp.uint32) * _GOLDEN >> 8  # a float32 holds 24 bits
+    point = (jnp.arange(arenas) + turned * np.float32(2.0**-24)) / arenas
+    ends = jnp.cumsum(weights)
+    inner = (ends / ends[-1])[:-1]
+    stage = jnp.searchsorted(inner, point, side="right", method="compare_all")
+    # The last point may round to 1. Without a limit it would lie behind all stages with a weight.
+    last = jnp.max(jnp.where(weights > 0.0, jnp.arange(ends.shape[0]), 0))
+    return jnp.minimum(stage, last).astype(jnp.int32)
+
+
+def sequential(
+    state: StagesState,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> StageChoice:
+    """Puts all arenas on the newest stage, and moves all of them on to the next stage.
+
+    The next stage begins when a whole cohort of the current stage has reached `threshold`, or at
+    the stage's deadline. At least one step limit lies between two decisions.
+
+    Args:
+      state: state of the mode.
+      schedule: the curriculum's numbers.
+      options: settings of the curriculum.
+      verdict: findings of the update.
+      update: [] number of the finished update, from 0; -1 before the first.
+
+    Returns:
+      The choice from the next update on.
+    """
+    stage, reason = _promote(state, schedule, verdict, update)
+    weights = jax.nn.one_hot(stage, state.chosen.weights.shape[0], dtype=jnp.float32)
+    return StageChoice(stage=stage, weights=weights, reason=reason)
+
+
+def mixed(
+    state: StagesState,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> StageChoice:
+    """Decides as `sequential`, but keeps `earlier_share` of the arenas on earlier stages, evenly.
+
+    Args:
+      state: as in `sequential`.
+      schedule: as in `sequential`.
+      options: as in `sequential`.
+      verdict: as in `sequential`.
+      update: as in `sequential`.
+
+    Returns:
+      The choice from the next update on.
+    """
+    stage, reason = _promote(state, schedule, verdict, update)
+    index = jnp.arange(state.chosen.weights.shape[0])
+    share = jnp.where(stage > 0, jnp.asarray(schedule.earlier_share), 0.0)
+    earlier = jnp.where(index < stage, share / jnp.maximum(stage, 1), 0.0)
+    return StageChoice(
+        stage=stage, weights=jnp.where(index == stage, 1.0 - share, earlier), reason=reason
+    )
+
+
+def adaptive(
+    state: StagesState,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> StageChoice:
+    """Trains all stages at once, with weights from their `score` and a floor for every stage.
+
+    The weights are computed again after every cohort. The score `learnability` is p (1 - p), where
+    p is the success. The reason is that nothing is learned where every episode succeeds or none
+    does (Tzannetos et al. 2023, "Proximal Curriculum for Reinforcement Learning Agents",
+    arXiv:2304.12877; Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
+    Approximations for Curriculum Discovery", arXiv:2408.15099). `failure` is
+    1 - p, so a stage that never succeeds is practised most. `learnability` gives such a stage only
+    the floor. `failure` is useful if all stages can be solved.
+
+    With `prerequisites` the first stages of the sequence are practised alone, until all of them
+    reach `threshold` or the deadline is past. Their skills are then learned before the other stages
+    teach different ones.
+
+    Args:
+      state: as in `sequential`.
+      schedule: as in `sequential`.
+      options: as in `sequential`.
+      verdict: as in `sequential`.
+      update: as in `sequential`.
+
+    Returns:
+      The choice from the next update on; its newest stage is the last one that is practised.
+    """
+    stage, reason = _unlock(state, schedule, options, verdict, update)
+    practised = jnp.arange(state.chosen.weights.shape[0]) <= stage
+    count = jnp.sum(practised, dtype=jnp.float32)
+    found = jnp.where(practised, _SCORES[options.score](verdict.record), 0.0)
+    total = jnp.sum(found)
+    share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / count)
+    floor = jnp.asarray(schedule.floor)
+    weights = jnp.where(practised, floor / count + (1.0 - floor) * share, 0.0)
+    if options.shares == "robots":
+        weights = _per_robot(weights, jnp.asarray(schedule.stages.robots))
+    return StageChoice(
+        stage=stage,
+        weights=jnp.where(verdict.over, weights, state.chosen.weights),
+        reason=reason,
+    )
+
+
+def _unlock(
+    state: StagesState,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> tuple[Array, Array]:
+    """Returns the last stage that is practised, and the reason for a change of weights."""
+    reweighed = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
+    last = jnp.full_like(state.chosen.stage, state.chosen.weights.shape[0] - 1)
+    if not options.prerequisites:
+        return last, reweighed.astype(jnp.int32)
+    first = options.prerequisites
+    passed = jnp.all(verdict.record.fast[:first] >= schedule.threshold)
+    late = update + 1 >= jnp.asarray(schedule.deadline)[first - 1]
+    unlocked = state.chosen.stage == last
+    opens = verdict.over & (passed | late) & ~unlocked
+    reason = jnp.where(opens, jnp.where(passed, BY_THRESHOLD, BY_BUDGET), reweighed)
+    return jnp.where(unlocked | opens, last, first - 1), reason.astype(jnp.int32)
+
+
+def _promote(
+    state: StagesState, schedule: Schedule, verdict: CohortVerdict, update: Array
+) -> tuple[Array, Array]:
+    """Returns the next or the same stage, and the reason."""
+    stage, deadline = state.chosen.stage, jnp.asarray(schedule.deadline)
+    last = stage == deadline.shape[0] - 1
+    whole = verdict.judged[stage] & (state.turn - 1 >= state.since)
+    success = verdict.success[stage]
+    settled = verdict.over | (state.turn > state.since)
+    late = update + 1 >= deadline
+    passed = whole & (success >= schedule.threshold) & ~last
+    expired = settled & late[stage] & ~last
+    reason = jnp.where(passed, BY_THRESHOLD, jnp.where(expired, BY_BUDGET, STAYED))
+    return stage + (passed | expired), reason.astype(jnp.int32)
+
+
+def _per_robot(weights: Array, robots: Array) -> Array:
+    """Turns shares of robots [S] into the shares of arenas that give them."""
+    arenas = weights / robots.astype(jnp.float32)
+    return arenas / jnp.sum(arenas)
+
+
+def _learnability(record: Record) -> Array:
+    return jnp.where(
+        jnp.isfinite(record.fast), record.fast * (1.0 - record.fast), _UNKNOWN_LEARNABILITY
+    )
+
+
+def _failure(record: Record) -> Array:
+    return 1.0 - jnp.where(jnp.isfinite(record.fast), record.fast, 0.0)
+
+
+_SCORES = {"learnability": _learnability, "failure": _failure}
+MODES: dict[str, Mode] = {"sequential": sequential, "mixed": mixed, "adaptive": adaptive}
