@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from swarmjax import policy_file
 from swarmjax.config import ConfigError, Section, build, files, inherit
-from swarmjax.config.section import modernise
+from swarmjax.config.section import build_stored
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
@@ -59,7 +59,7 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     robot = {
         "max_speed": high[0],
         "max_turn_rate": -low[1],
-        **modernise(RobotConfig, config.get("robot", {})),
+        **config.get("robot", {}),
         **_known(RobotConfig, meta["robot"]),
     }
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
@@ -71,9 +71,9 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     realism = meta.get("realism") or config.get("realism") or sensors
     stages = meta.get("stages") or meta["config"].get("stage") or []
     return Trained(
-        robot=build(RobotConfig, robot, f"{path}: meta.robot."),
+        robot=build_stored(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),
-        realism=build(RealismConfig, modernise(RealismConfig, realism), f"{path}: meta.realism."),
+        realism=build_stored(RealismConfig, realism, f"{path}: meta.realism."),
         stages=[stages] if isinstance(stages, dict) else list(stages),
     )
 
