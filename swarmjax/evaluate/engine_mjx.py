@@ -176,7 +176,7 @@ def play(
     run = _program(
         world,
         steps,
-        (trained.encoding, trained.history, trained.meta["observation"]["limit"]),
+        (trained.encoding, trained.meta["observation"]["limit"]),
         judge.neighbours(trained),
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
@@ -198,7 +198,7 @@ def play(
 def _program(
     world: World,
     steps: int,
-    seen: tuple[electronics.Encoding, int, float],
+    seen: tuple[electronics.Encoding, float],
     heard: NeighboursConfig,
     limits: tuple[float, float],
     activation: str,
@@ -206,11 +206,11 @@ def _program(
     network: Any,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """Compiles the program for policies that differ only in their weights."""
-    (encoding, history, limit), (speed, turn_rate) = seen, limits
+    (encoding, limit), (speed, turn_rate) = seen, limits
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        task=replace(world.task, history=history, neighbours=heard),
+        task=replace(world.task, neighbours=heard),
         electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
     )
 

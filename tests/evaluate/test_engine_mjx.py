@@ -290,17 +290,10 @@ def test_the_engines_of_the_command_agree(
         np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free])
 
 
-@pytest.mark.parametrize(("kind", "size"), [("gru", 6), ("history", 4)])
-def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path, kind: str, size: int) -> None:
-    given, told = policies.recalling(kind, _arrays((STEER,)), size)
-    if kind == "gru":
-        given["actor/mean/kernel"][:, 2:] *= 0.3  # smaller, beside the steering
-        none = {name: array * ("memory" not in name) for name, array in given.items()}
-    else:
-        kernel = given["actor/hidden_0/kernel"]
-        kernel[:, observation.SIZE :] *= 0.5
-        newest = np.arange(kernel.shape[1]) < observation.SIZE
-        none = given | {"actor/hidden_0/kernel": kernel * newest[:, None]}
+def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
+    given, told = policies.recalling(_arrays((STEER,)), 6)
+    given["actor/mean/kernel"][:, 2:] *= 0.3  # smaller, beside the steering
+    none = {name: array * ("memory" not in name) for name, array in given.items()}
     path = tmp_path / "policy.npz"
     said = policies.meta(activation="relu", **told)
     policy_file.write(path, given | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
