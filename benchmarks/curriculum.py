@@ -30,12 +30,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks import curriculum_arms
+from benchmarks import curriculum_arms, learners_judge
 from benchmarks.curriculum_arms import StudyConfig
+from benchmarks.learners_judge import Outcomes
 from swarmjax import command, provenance
 from swarmjax.config import to_dict
-from swarmjax.evaluate import engine_mjx
-from swarmjax.evaluate.engine_mjx import Outcomes
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
 from swarmjax.run.settings import TrainConfig
@@ -76,7 +75,7 @@ def load_judge(study: StudyConfig, trained: TrainConfig, judged: dict[str, Stage
         arenas=arenas * trained.seeds,
     )
     levels = draw_levels(world, stages, study.level_seed, study.levels)
-    run = partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)
+    run = partial(learners_judge.outcomes, world, trained.algo, steps=trained.task.step_limit)
     call = jax.jit(jax.vmap(run, in_axes=(0, None)))
     return lambda learners: means(call(learners, levels), list(judged))
 
@@ -93,7 +92,7 @@ def draw_levels(world: World, stages: Sequence[StageConfig], seed: int, count: i
     Returns:
       [S E] levels.
     """
-    drawn = [engine_mjx.draw_levels(world, stage, seed, count) for stage in stages]
+    drawn = [learners_judge.draw_levels(world, stage, seed, count) for stage in stages]
     return Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
 
 

@@ -32,11 +32,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from benchmarks.curriculum_arms import BASELINE
+from benchmarks.curves import area_under, steps_to
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import statistics
-from swarmjax.evaluate.curves import area_under, curve, steps_to
-from swarmjax.evaluate.statistics import Interval
+from swarmjax.evaluate.statistics import Interval, curve
 from swarmjax.run.settings import TrainConfig
 
 MEASURES = {"targets_reached": "targets reached", "all_reached": "episodes in which all arrived"}

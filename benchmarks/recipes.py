@@ -19,11 +19,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks import key_value
+from benchmarks import key_value, learners_judge
 from swarmjax import command, provenance
 from swarmjax.config import Section, about, build, to_dict
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import trainer
 from swarmjax.run.load_settings import load_train
@@ -89,7 +88,8 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
         arenas=len(stages) * recipe.levels * trained.seeds,
     )
     drawn = [
-        engine_mjx.draw_levels(world, stage, recipe.level_seed, recipe.levels) for stage in stages
+        learners_judge.draw_levels(world, stage, recipe.level_seed, recipe.levels)
+        for stage in stages
     ]
     levels = Level(*(np.concatenate(fields) for fields in zip(*drawn, strict=True)))
 
@@ -103,7 +103,7 @@ def load_judge(recipe: RecipeConfig, trained: TrainConfig) -> Judge:
                     found[stage].setdefault(action, {})[name] = part.mean(axis=1)
         return found
 
-    run = partial(engine_mjx.outcomes, world, trained.algo, steps=recipe.steps)
+    run = partial(learners_judge.outcomes, world, trained.algo, steps=recipe.steps)
     calls = {
         action: jax.jit(jax.vmap(partial(run, sampled=sampled), in_axes=(0, None)))
         for action, sampled in (("drawn", True), ("mean", False))

@@ -20,11 +20,10 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from benchmarks import curriculum, key_value
+from benchmarks import curriculum, key_value, learners_judge
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run import checkpoint
 from swarmjax.run.load_settings import load_train
@@ -190,7 +189,7 @@ def load_judge(study: Study, trained: TrainConfig) -> curriculum.Judge:
         arenas=len(stages) * study.levels * trained.seeds,
     )
     levels = curriculum.draw_levels(world, stages, study.level_seed, study.levels)
-    run = partial(engine_mjx.outcomes, world, config, steps=study.steps, sampled=True)
+    run = partial(learners_judge.outcomes, world, config, steps=study.steps, sampled=True)
     call = jax.jit(jax.vmap(lambda learners: run(learners, levels)))
     names = [stage.name for stage in stages]
     return lambda learners: curriculum.means(call(learners), names)

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.curriculum_table import chance_of_seeds, over_seeds
+from benchmarks.curves import steps_to
 from swarmjax import command
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import statistics
-from swarmjax.evaluate.curves import steps_to
 from swarmjax.evaluate.statistics import Interval
 from swarmjax.run.settings import TrainConfig
 

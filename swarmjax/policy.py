@@ -4,15 +4,14 @@ import hashlib
 import json
 import math
 import zipfile
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-FORMAT = 2
-MEMORY_FORMAT = 4  # for a policy with a memory or a history
-HEARING_FORMAT = 5  # for a policy that hears neighbours, with or without memory
+FORMAT = 5
 MAX_BYTES = 2**30  # limit for all arrays; with two layers of 64 they take 20 kB
 _MAX_LIST = 2**16  # bytes of the list of members; a name takes a hundred
 MAX_LETTERS = 2**20  # characters of `meta`, four bytes each
@@ -34,18 +33,18 @@ class Policy(NamedTuple):
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
     log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
-    mean: np.ndarray  # [L, k O], mean of the observations, newest first; k is `history`
-    std: np.ndarray  # [L, k O], their deviation
+    mean: np.ndarray  # [L, O], mean of the observations
+    std: np.ndarray  # [L, O], their deviation
     is_shared: bool
     encoding: Any  # "metric" or "webots"
     max_speed: float  # m/s; commands begin at 0
     max_turn_rate: float  # rad/s, to either side
     meta: dict[str, Any]
     digest: str  # SHA-256 of the rest of the file, in hexadecimal
-    network: Any = None  # with `meta["network"]`: normalised [..., R, k O] to features
-    # format 4: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
+    network: Any = None  # with `meta["network"]`: normalised [..., R, O] to features
+    # with `meta["memory"]`: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
     memory: tuple[np.ndarray, ...] | None = None
-    # format 5: kernel [L, W, E] and bias [L, E] of the layer for neighbours
+    # with `neighbours`: kernel [L, W, E] and bias [L, E] of the layer for them
     hearing: tuple[np.ndarray, ...] | None = None
 
     @property
@@ -54,56 +53,73 @@ class Policy(NamedTuple):
         return self.meta["observation"].get("neighbours", {})
 
     @property
-    def history(self) -> int:
-        """Number of observations that the policy uses: the last one, and earlier ones."""
-        return self.meta["observation"].get("history", 1)
-
-    @property
     def carried(self) -> int:
         """Count of numbers that a robot carries from one control step to the next."""
-        if self.memory is not None:
-            return self.memory[2].shape[1]
-        return (self.history - 1) * (self.mean.shape[1] // self.history)
+        return 0 if self.memory is None else self.memory[2].shape[1]
 
 
 def load(path: str | Path | IO[bytes]) -> Policy:
     """Returns the policy in a file (path, or open in binary); raises PolicyError if invalid."""
-    try:
-        if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
-            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
-        with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
-            arrays = _read(file)
-        found, text = _text(arrays.pop("digest")), _text(arrays["meta"])
-        if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
-            raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
+    arrays, text, said = read(path)
+    with _one_sentence(path):
         meta = json.loads(text)
-        seen = meta.get("observation", {})
-        history = seen.get("history", 1)
-        if type(history) is not int or history < 1:
-            raise ValueError(f"meta.observation.history is {json.dumps(history)[:80]}")
-        hears = "neighbours" in seen
-        wanted = MEMORY_FORMAT if "memory" in meta or history > 1 else FORMAT
-        wanted = HEARING_FORMAT if hears else wanted
-        if meta["format"] in (MEMORY_FORMAT, HEARING_FORMAT) and "network" in meta:
+        if meta["format"] != FORMAT:
+            raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {FORMAT}")
+        if "network" in meta:
             raise ValueError("its network is code of an extension")
-        if meta["format"] != wanted:
-            raise ValueError(f"meta.format is {json.dumps(meta['format'])[:80]}, not {wanted}")
-        if found != digest(arrays):
-            raise ValueError("digest is not that of the arrays")
-        memory = (
-            tuple(arrays.pop(f"actor/memory/{n}") for n in MEMORY) if "memory" in meta else None
-        )
-        parts = ("kernel", "bias")
-        hearing = tuple(arrays.pop(f"actor/hearing/{n}") for n in parts) if hears else None
-        names = [*(f"hidden_{i}" for i in range((len(arrays) - 6) // 2)), "mean"]
-        layers = [(arrays[f"actor/{n}/kernel"], arrays[f"actor/{n}/bias"]) for n in names]
-        rest = [arrays[n] for n in ("actor/log_std", "normalizer/mean", "normalizer/std")]
-        rest += [meta["policy"] == "shared", meta["observation"]["encoding"]]
-        rest += [*meta["action"]["high"][:2], meta, found]
-        return Policy(*[layers, *rest], memory=memory, hearing=hearing)
+        return assemble(arrays, meta, said)
+
+
+@contextmanager
+def _one_sentence(path: str | Path | IO[bytes]) -> Iterator[None]:
+    try:
+        yield
     except Exception as error:  # zipfile, NumPy and json raise many errors for a damaged file
         reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
         raise PolicyError(f"{path} cannot be read as a policy: {reason[:200]}.") from None
+
+
+def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]:
+    """Returns a file's arrays, the JSON text of its `meta`, and its digest, which is right."""
+    with _one_sentence(path):
+        if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
+            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
+        with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
+            arrays = _unpack(file)
+        said, text = _text(arrays, "digest"), _text(arrays, "meta")
+        if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
+            raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
+        del arrays["digest"]
+        if said != digest(arrays):
+            raise ValueError("its digest is not that of its arrays: it was changed or damaged")
+        del arrays["meta"]
+        return arrays, text, said
+
+
+def assemble(
+    arrays: dict[str, np.ndarray], meta: dict[str, Any], said: str, network: Any = None
+) -> Policy:
+    """Returns the policy of a file's arrays, `meta`, digest and extension's network."""
+
+    def layer(name: str) -> tuple[np.ndarray, np.ndarray]:
+        return arrays[f"actor/{name}/kernel"], arrays[f"actor/{name}/bias"]
+
+    hidden = sum(name.startswith("actor/hidden_") for name in arrays) // 2
+    return Policy(
+        layers=[*(layer(f"hidden_{i}") for i in range(hidden)), layer("mean")],
+        log_std=arrays["actor/log_std"],
+        mean=arrays["normalizer/mean"],
+        std=arrays["normalizer/std"],
+        is_shared=meta["policy"] == "shared",
+        encoding=meta["observation"]["encoding"],
+        max_speed=meta["action"]["high"][0],
+        max_turn_rate=meta["action"]["high"][1],
+        meta=meta,
+        digest=said,
+        network=network,
+        memory=tuple(arrays[f"actor/memory/{n}"] for n in MEMORY) if "memory" in meta else None,
+        hearing=layer("hearing") if "neighbours" in meta["observation"] else None,
+    )
 
 
 def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
@@ -117,51 +133,54 @@ def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
     return zipfile.ZipFile(file)
 
 
-def _read(file: IO[bytes]) -> dict[str, np.ndarray]:
+def _unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
     """Reads the arrays of an archive; refuses one that unpacks to more bytes than the file has."""
     with open_archive(file) as archive:
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:
             raise ValueError(f"it unpacks to more than the file, or {MAX_BYTES} bytes")
         plain = {x.filename for x in members if not (x.compress_type or x.flag_bits & 1)}
-        if len(plain) < len(members):
-            raise ValueError("a member is compressed, encrypted or duplicated")
+        if len(plain) < len(members) or not all(name.endswith(".npy") for name in plain):
+            raise ValueError("a member is compressed, encrypted, duplicated or no .npy file")
         return {x.filename.removesuffix(".npy"): read_array(archive, x) for x in members}
 
 
 def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
     """Reads a member, and checks that its size matches its header."""
     with archive.open(member) as file:
-        if np.lib.format.read_magic(file) != (1, 0):
-            raise ValueError(f"{member.filename!r} is not of npy version 1.0")
-        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
-        size = file.tell() + math.prod(shape) * dtype.itemsize
-        if dtype.hasobject or is_fortran or size != member.file_size:
-            raise ValueError(f"{member.filename!r} does not match its header")
-        return np.frombuffer(file.read(), dtype).reshape(shape)
+        try:
+            version = np.lib.format.read_magic(file)
+            shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            size = file.tell() + math.prod(shape) * dtype.itemsize
+            is_plain = version == (1, 0) and dtype.kind in "biufU" and not is_fortran
+            if not is_plain or size != member.file_size:
+                raise ValueError
+            return np.frombuffer(file.read(), dtype).reshape(shape)
+        except ValueError:  # NumPy raises it too, for a damaged header
+            raise ValueError(f"{member.filename!r} is not the array that its header says") from None
 
 
-def _text(array: np.ndarray) -> str:
-    if array.dtype.kind == "U" and not array.shape and array.itemsize <= 4 * MAX_LETTERS:
-        return array.item()
-    raise ValueError(f"meta or digest is not a text of at most {MAX_LETTERS} characters")
+def _text(arrays: dict[str, np.ndarray], name: str) -> str:
+    array = arrays.get(name, np.empty(0))
+    if array.dtype.str[:2] == "<U" and not array.shape and array.itemsize <= 4 * MAX_LETTERS:
+        return str(array.tobytes(), "utf-32-le").rstrip("\0")
+    raise ValueError(f"{name} is not a text of at most {MAX_LETTERS} characters")
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
     """Returns the SHA-256 over the names, types, shapes and bytes of arrays, sorted by name."""
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for name, x in sorted(arrays.items()):
-        found.update(f"{name} {x.dtype.str} {list(x.shape)}\n".encode())
-        found.update(np.ascontiguousarray(x).reshape(-1).view(np.uint8))  # without a copy
-    return found.hexdigest()
+        sha.update(f"{name} {x.dtype.str} {list(x.shape)}\n".encode())
+        sha.update(np.ascontiguousarray(x).reshape(-1).view(np.uint8))  # without a copy
+    return sha.hexdigest()
 
 
 def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarray:
     """Draws the action of each robot; without `normal` it is the most likely one.
 
     Args:
-      policy: Has no memory and no history. It has one learner for all robots, or at least R
-        learners.
+      policy: Has no memory. It has one learner for all robots, or at least R learners.
       observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
       normal: [..., R, U] standard normal, drawn afresh at each control step.
 
@@ -174,34 +193,23 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
 
 
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Returns the memory of robots whose episode begins; None if there is none.
-
-    The memory is [*shape, H]. With a history it is the earlier observations, [*shape, (k - 1) O].
-    """
+    """Returns the memory [*shape, H] of robots whose episode begins; None if there is none."""
     return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 
 
 def step(
     policy: Policy, memory: np.ndarray | None, observation: np.ndarray, normal: Any = 0.0
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Draws actions as `act` does, and updates the memory.
+    """Draws actions as `act` does; returns the memory after this step, and the actions.
 
     Args:
-      policy: Has one learner for all robots, or at least R learners.
+      policy: As in `act`, with or without a memory.
       memory: [..., R, H] from `begin` or from the step before.
-      observation: As in `act`; even with a history, only that of this control step.
-      normal: As in `act`.
-
-    Returns:
-      The memory after this step, and the action.
+      observation, normal: As in `act`.
     """
     _check(policy, memory, observation)
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
-    x = observation.astype(np.float32)
-    if policy.history > 1 and memory is not None:
-        x = np.concatenate([x, memory], axis=-1)
-        memory = x[..., : policy.carried]
-    x = (x - policy.mean[mine]) / policy.std[mine]
+    x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
     x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
     if policy.hearing is not None:
         x = _hear([part[mine] for part in policy.hearing], policy, x)
@@ -217,17 +225,15 @@ def step(
 
 def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -> None:
     """Refuses arguments of `step` with wrong shapes."""
-    robots, learners = observation.shape[-2], len(policy.mean)
+    robots, (learners, size) = observation.shape[-2], policy.mean.shape
     if robots > learners and not policy.is_shared:
         raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
-    size = policy.mean.shape[1] // policy.history
     if observation.shape[-1] != size:
         raise PolicyError(f"observation has {observation.shape[-1]} entries: give {size}.")
     expected = begin(policy, observation.shape[:-1])
     if getattr(memory, "shape", None) != getattr(expected, "shape", None):
-        found = "none" if memory is None else list(np.shape(memory))
-        wanted = "none" if expected is None else list(expected.shape)
-        raise PolicyError(f"memory is {found}: give {wanted}, as `begin` returns it.")
+        given, wanted = ("none" if x is None else list(np.shape(x)) for x in (memory, expected))
+        raise PolicyError(f"memory is {given}: give {wanted}, as `begin` returns it.")
 
 
 def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
@@ -241,10 +247,8 @@ def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
     """Updates the memory with a gated recurrent unit (GRU) whose reset gate follows the product."""
-    seen, recalled = (
-        np.vecmat(features, parts[0]) + parts[1],
-        np.vecmat(memory, parts[2]) + parts[3],
-    )
+    seen = np.vecmat(features, parts[0]) + parts[1]
+    recalled = np.vecmat(memory, parts[2]) + parts[3]
     (r, z, fresh), (r_, z_, old) = np.split(seen, 3, -1), np.split(recalled, 3, -1)
     fresh = np.tanh(fresh + _logistic(r + r_) * old)
     return fresh + _logistic(z + z_) * (memory - fresh)

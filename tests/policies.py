@@ -26,7 +26,10 @@ EMBODIMENT = {
         "max_wheel_speed": epuck.MAX_WHEEL_SPEED,
     },
     "sensors": {"preset": "ideal", "response": "ideal", "range": epuck.SENSOR_RANGE},
-    "task": {"control_step": 0.032, "target_radius": 0.05},
+    "task": {"control_step": 0.032, "target_radius": 0.05, "arrival": "latch"},
+    "realism": {"name": "ideal", "infrared": "ideal"},
+    "stages": [],
+    "extensions": {},
     "seed": 0,
 }
 
@@ -77,27 +80,9 @@ def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
     return found | {"actor/mean/kernel": np.concatenate([kernel, more], axis=1)}
 
 
-def stacked(given: Arrays, history: int, seed: int = 2) -> Arrays:
-    """Returns these networks with previous observations as further inputs, `history` in all."""
-    draw = np.random.default_rng(seed)
-    kernel = given["actor/hidden_0/kernel"]
-    learners, size, width = kernel.shape
-    more = draw.normal(size=(learners, (history - 1) * size, width)) / np.sqrt(history * size)
-    found = dict(given)
-    found["actor/hidden_0/kernel"] = np.concatenate([kernel, more.astype(np.float32)], axis=1)
-    # Each age has a normaliser of its own.
-    aged = np.repeat(np.linspace(1.0, 1.5, history, dtype=np.float32), size)
-    for name in ("normalizer/mean", "normalizer/std"):
-        found[name] = np.tile(given[name], (1, history)) * aged
-    return found
-
-
-def recalling(kind: str, given: Arrays, size: int, **said: Any) -> tuple[Arrays, dict[str, Any]]:
-    """Returns these networks with a `gru` or a `history` of this size, and their `meta`."""
-    if kind == "gru":
-        return remembering(given, size), said | {"memory": {"kind": "gru", "size": size}}
-    layout = said.get("observation", observed()) | {"history": size}
-    return stacked(given, size), said | {"observation": layout}
+def recalling(given: Arrays, size: int, **said: Any) -> tuple[Arrays, dict[str, Any]]:
+    """Returns these networks with a memory of `size` numbers, and their `meta`."""
+    return remembering(given, size), said | {"memory": {"kind": "gru", "size": size}}
 
 
 def hearing(
@@ -190,8 +175,7 @@ def seen(trained: Policy, count: int, seed: int = 0) -> np.ndarray:
     limit, so that some are clipped.
     """
     draw = np.random.default_rng(seed)
-    size = trained.mean.shape[1] // trained.history
-    mean, std = trained.mean[:, :size], trained.std[:, :size]
+    mean, std = trained.mean, trained.std
     shape = (count // 2, *mean.shape)
     names = tuple(trained.meta["observation"]["names"])
     low = by_name(names, infrared=0.0, distance=0.0, bearing=-np.pi, other=-1.0)

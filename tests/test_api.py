@@ -229,7 +229,7 @@ def test_64_bits_are_refused_in_one_sentence(
         (lambda: swarmjax.make_env("s3", arenas=0), r"^arenas is 0: give 1 to 1048576"),
         (lambda: swarmjax.make_env("s3", extensions="no.py"), r"^extensions is 'no.py', which "
         "cann"),
-        (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is called algo\.hid"),
+        (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is not a key: did y"),
         (lambda: swarmjax.train_policy("stage=s3"), r"^settings is 'stage=s3': give a list of wor"),
         (lambda: swarmjax.train_policy({"run.dry": True}), r"^run\.dry is true, but works only on"),
         (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),

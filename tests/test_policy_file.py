@@ -24,7 +24,7 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
-from swarmjax.policy import MAX_BYTES, PolicyError
+from swarmjax.policy import FORMAT, PolicyError
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
 from swarmjax.task.observation import SIZE
@@ -35,7 +35,7 @@ def _f32(values: Any) -> np.ndarray:
 
 
 def _said(**changes: Any) -> dict[str, Any]:
-    return {"format": 2} | policies.meta(**changes)
+    return {"format": FORMAT} | policies.meta(**changes)
 
 
 def test_a_written_policy_comes_back_bit_for_bit(tmp_path: Path) -> None:
@@ -95,23 +95,17 @@ def _part(part: str, **changes: Any) -> dict[str, Any]:
     return {part: policies.meta()[part] | changes}
 
 
-def _history(count: int) -> dict[str, Any]:
-    return {"format": 4} | _part("observation", history=count)
-
-
 _GOOD = policies.arrays()
 _RECALLS = policies.remembering(_GOOD, 5)
-_STACKS = policies.stacked(_GOOD, 3)
 _HEARS, _HEARD = policies.hearing(_GOOD, 2, 1)
-_HEARS_META: dict[str, Any] = {"format": 5} | _HEARD
 
 
 def _heard(**changes: Any) -> dict[str, Any]:
-    layout = _HEARS_META["observation"]
-    return _HEARS_META | {"observation": layout | {"neighbours": layout["neighbours"] | changes}}
+    layout = _HEARD["observation"]
+    return _HEARD | {"observation": layout | {"neighbours": layout["neighbours"] | changes}}
 
 
-_MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
+_MEMORY = {"memory": {"kind": "gru", "size": 5}}
 
 
 @pytest.mark.parametrize(
@@ -140,39 +134,17 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (_HEARS, _heard(range=0), r"meta.observation.neighbours.range is 0: expected a number ab"),
         (_HEARS, _heard(count=9), r"meta.observation.neighbours takes 45 entries, but m"),
         (_HEARS, _heard(message_size=2), r"meta.action.names is \["),
-        (_HEARS, _HEARS_META | {"format": 2}, r"meta.format is 2, but this version reads 2, 3"),
-        (_HEARS, _HEARS_META | {"network": "mine"}, r"meta.observation.neighbours and meta.n"),
+        (_HEARS, _HEARD | {"format": 2}, r"meta.format is 2, but this version reads 5 only: "),
+        (_HEARS, _HEARD | {"network": "mine"}, r"meta.observation.neighbours and meta.n"),
         (
             {key: array for key, array in _HEARS.items() if key != "actor/hearing/bias"},
-            _HEARS_META,
+            _HEARD,
             r"actor/hearing/bias is missing",
-        ),
-        (
-            _GOOD,
-            _part("observation", history=0),
-            r"meta.observation.history is 0: expected 1 to 64",
-        ),
-        (_STACKS, _history(65), r"meta.observation.history is 65: expected 1 to 64"),
-        (
-            _STACKS,
-            _part("observation", history="3"),
-            r'meta.observation.history is "3": expected a',
-        ),
-        (
-            _STACKS,
-            _history(2),
-            rf"actor/hidden_0/kernel has shape \[1, {3 * SIZE}, 4\]: expected \[1, {2 * SIZE}, 4\]",
-        ),
-        (_STACKS, _history(3) | {"format": 2}, r"meta.format is 2, but this version reads 2, 3 w"),
-        (
-            _RECALLS,
-            _MEMORY | _history(3),
-            r"meta.observation.history is 3 beside meta.memory: expected one of them",
         ),
         (_RECALLS, _MEMORY | {"network": "mine"}, r"meta.memory and meta.network are both"),
         (_without("actor/hidden_0/kernel"), {}, r"actor/hidden_0/kernel is missing"),
         (_without("normalizer/std"), {}, r"normalizer/std is missing"),
-        (_with("critic/bias", _f32([1])), {}, r'"critic/bias.npy" is not known: format 2'),
+        (_with("critic/bias", _f32([1])), {}, r'"critic/bias" is not known: format 5'),
         (_with("actor/hidden_2/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/hidden_7/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/log_std", np.zeros((1, 2))), {}, r"actor/log_std is float64: expected float"),
@@ -198,11 +170,6 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
             rf"actor/hidden_0/kernel has shape \[2, {SIZE}, 4\]: expected \[1, {SIZE}, 4\]",
         ),
         (
-            _with("actor/mean/kernel", np.asfortranarray(np.ones((1, 3, 2), np.float32))),
-            {},
-            r"actor/mean/kernel is not a plain array: expected one of npy version 1\.0",
-        ),
-        (
             _with("actor/hidden_1/bias", _f32([[0, np.inf, 0]])),
             {},
             r"actor/hidden_1/bias holds a value that is not finite",
@@ -215,8 +182,8 @@ _MEMORY = {"format": 4, "memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             {"format": 1},
-            r"meta.format is 1, but this version reads 2, 3 with meta.network, 4 with "
-            "meta.memory or a history, and 5 with neighbours: export the policy",
+            r"meta.format is 1, but this version reads 5 only: d8b3078 is the last commit that "
+            "reads formats 2 to 4",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
         (_GOOD, {"policy": "mine"}, r'meta.policy is "mine": expected shared or independent'),
@@ -334,8 +301,9 @@ def test_the_digest_covers_arrays_and_meta(tmp_path: Path) -> None:
     faster = _said(**_part("action", high=[0.25, 3.14]))
     for arrays, said in ((policies.arrays(seed=1), _said()), (_GOOD, faster)):
         forge(path, arrays, said, digest=sound)
-        sentence = r"policy\.npz: digest is \"\w{12}\"\.\.\., but the content has digest \"\w{12}\""
-        with pytest.raises(PolicyError, match=sentence):
+        with pytest.raises(
+            PolicyError, match=r"its digest is not that of its arrays: it was chang"
+        ):
             policy_file.read(path)
 
 
@@ -345,7 +313,7 @@ def test_the_digest_covers_arrays_and_meta(tmp_path: Path) -> None:
         ("{", r"meta cannot be read: "),
         ("[1]", r"meta is \[1\]: expected a JSON object"),
         ('{"format": ' + "9" * 5000 + "}", r"meta cannot be read: "),
-        ("[" * 100_000, r"meta cannot be read: "),
+        ("[" * 60_000, r"meta cannot be read: "),
     ],
 )
 def test_read_refuses_foreign_meta(tmp_path: Path, text: str, sentence: str) -> None:
@@ -382,66 +350,76 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "sentence"),
+    "data",
     [
-        ("actor/mean/bias", _npy("<f4", "2000000000, 2"), "is not a plain array"),
-        ("actor/mean/bias", _npy("<f4", "200000000, 2"), "does not have as many values as its"),
+        _npy("<f4", "2000000000, 2"),
+        _npy("<f4", "200000000, 2"),
         # NumPy has 64 axes at most. A shape with an axis of 0 needs no data, however large its
         # other axes are.
-        ("actor/mean/bias", _npy("<f4", ", ".join("1" * 65), b"\0" * 4), "is not a plain array"),
-        (
-            "actor/mean/bias",
-            _npy("<f4", "1, 1, 1, 1, 1, 1, 1, 1, 2", b"\0" * 8),
-            "is not a plain array",
-        ),
-        (
-            "actor/mean/bias",
-            _npy("<c16", "0, 999999999, 999999999"),
-            r"has shape \[0, 999999999, 999999999\]: expected no axis of length 0",
-        ),
-        ("actor/mean/bias", _npy("<f4", "01, 2", b"\0" * 8), "is not a plain array"),
-        (
-            "actor/mean/bias",
-            _npy("<f4", "1, 2", b"\0" * 8, spaces=10_000),
-            "is not a plain array",
-        ),
-        ("actor/mean/bias", _npy("|O", "1, 2", b"\0" * 16), r"is \|O: expected numbers or text"),
-        ("actor/mean/bias", _npy("<f9", "1, 2", b"\0" * 18), "is <f9: expected numbers or text"),
-        ("actor/mean/bias", _npy("<U0", "", b""), "is <U0: expected numbers or text"),
-        ("actor/mean/bias", b"", "is not a plain array"),
-        ("actor/mean/bias", b"\x93NUMPY\x01\x00\xff\xff", "is not a plain array"),
-        ("meta", _npy("<U1", "", b"\xff\xff\xff\xff"), "cannot be read: expected text in Unicode"),
-        ("meta", _npy("<f4", "", b"\0" * 4), r"is float32 \[\]: expected a single "),
-        ("digest", _npy("<U1", "2,", b"\0" * 8), r"is <U1 \[2\]: expected a single "),
+        _npy("<f4", ", ".join("1" * 65), b"\0" * 4),
+        _npy("<c16", "0, 999999999, 999999999"),
+        _npy("<f4", "01, 2", b"\0" * 8),
+        _npy("<f4", "1, 2", b"\0" * 8, spaces=10_000),
+        _npy("|O", "1, 2", b"\0" * 16),
+        _npy("<f9", "1, 2", b"\0" * 18),
+        _npy("<U0", "", b""),
+        b"",
+        b"\x93NUMPY\x01\x00\xff\xff",
     ],
 )
-def test_read_refuses_a_forged_member(
-    tmp_path: Path, name: str, data: bytes, sentence: str
-) -> None:
-    path = tmp_path / "policy.npz"
+def test_read_refuses_a_forged_member(tmp_path: Path, data: bytes) -> None:
+    sentence = "'actor/mean/bias.npy' is not the array that its header says"
+    assert sentence in _refused(tmp_path, "actor/mean/bias", data)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "sentence"),
+    [
+        ("meta", _npy("<U1", "", b"\xff\xff\xff\xff"), "code point not in range"),
+        ("meta", _npy("<f4", "", b"\0" * 4), "meta is not a text of at most 1048576 characters"),
+        ("digest", _npy("<U1", "2,", b"\0" * 8), "digest is not a text of at most 1048576 charac"),
+    ],
+)
+def test_read_refuses_a_forged_text(tmp_path: Path, name: str, data: bytes, sentence: str) -> None:
+    assert sentence in _refused(tmp_path, name, data)
+
+
+def _refused(folder: Path, name: str, data: bytes) -> str:
+    """Returns the sentence that refuses a policy with this member."""
+    path = folder / "policy.npz"
     saved(path)
     members = dict(_members(path.read_bytes())) | {f"{name}.npy": data}
     path.write_bytes(_zip(list(members.items())))
-    with pytest.raises(PolicyError, match=rf"policy\.npz: {name} {sentence}[^\n]*\.$"):
+    with pytest.raises(
+        PolicyError, match=r"policy\.npz cannot be read as a policy: [^\n]*\.$"
+    ) as caught:
         policy_file.read(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil", "/meta", "actor/hidden_0/kernel/x", "a\nb", "network/a/../b", "network/"]
+)
+def test_read_refuses_arrays_that_no_policy_has(tmp_path: Path, name: str) -> None:
+    forge(tmp_path / "policy.npz", _with(name, _f32([1])), _said())
+    with pytest.raises(PolicyError, match=r'policy\.npz: "[^\n]+" is not known: format 5 has no'):
+        policy_file.read(tmp_path / "policy.npz")
 
 
 def test_read_refuses_members_that_no_policy_has(tmp_path: Path) -> None:
     path = tmp_path / "policy.npz"
     saved(path)
     members = _members(path.read_bytes())
-    for name in ("../evil.npy", "/meta.npy", "meta", "actor/hidden_0/kernel/x.npy", "a\nb.npy"):
-        path.write_bytes(_zip([*members, (name, b"")]))
-        with pytest.raises(PolicyError, match=r'policy\.npz: "[^\n]+" is not known'):
-            policy_file.read(path)
     with pytest.warns(UserWarning, match="Duplicate"):
-        path.write_bytes(_zip([*members, members[0]]))
-    with pytest.raises(PolicyError, match=r'npy" appears more than once'):
-        policy_file.read(path)
+        doubled = _zip([*members, members[0]])
     # A compressed member could unpack to any size.
-    path.write_bytes(_zip(members, zipfile.ZIP_DEFLATED))
-    with pytest.raises(PolicyError, match=r'npy" is compressed or encrypted'):
-        policy_file.read(path)
+    compressed = _zip(members, zipfile.ZIP_DEFLATED)
+    for content in (doubled, compressed, _zip([*members, ("meta", b"")])):
+        path.write_bytes(content)
+        with pytest.raises(
+            PolicyError, match=r"duplicated or no \.npy file|unpacks to more than the"
+        ):
+            policy_file.read(path)
 
 
 def test_read_refuses_members_that_overlap(tmp_path: Path) -> None:
@@ -460,26 +438,9 @@ def test_read_refuses_members_that_overlap(tmp_path: Path) -> None:
         directory[at + 20 : at + 28] = len(content).to_bytes(4, "little") * 2
         at += 46 + len(name)
     path.write_bytes(content[:start] + bytes(directory))
-    total = len(names) * len(content)
-    assert total > sum(sizes)
-    sentence = rf"its members have {total} bytes in all: expected at most the {len(content)} of "
-    with pytest.raises(PolicyError, match=sentence):
+    assert len(names) * len(content) > sum(sizes)
+    with pytest.raises(PolicyError, match="it unpacks to more than the file, or 1073741824 bytes"):
         policy_file.read(path)
-
-
-def test_what_only_the_second_reading_finds_names_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "policy.npz"
-    saved(path)
-
-    def fail(_: Any) -> None:
-        raise ValueError("no such thing")
-
-    monkeypatch.setattr(np.lib.format, "read_magic", fail)
-    with pytest.raises(PolicyError) as caught:
-        policy_file.read(path)
-    assert str(caught.value) == f"{path} cannot be read as a policy: no such thing."
 
 
 def test_an_open_file_is_read_wherever_it_stands(tmp_path: Path) -> None:
@@ -488,17 +449,6 @@ def test_an_open_file_is_read_wherever_it_stands(tmp_path: Path) -> None:
     with path.open("rb") as file:
         file.seek(1000)
         assert policy.load(file).digest == digest
-
-
-def test_read_refuses_a_file_that_is_too_large_before_reading_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "policy.npz"
-    with path.open("wb") as file:
-        file.truncate(MAX_BYTES + 1)  # a hole, which takes no room on the disk
-    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("read"))
-    with pytest.raises(PolicyError, match=rf"has {MAX_BYTES + 1} bytes: a policy has {MAX_BYTES} "):
-        policy_file.read(path)
 
 
 def test_read_refuses_what_is_no_file(tmp_path: Path) -> None:
@@ -688,7 +638,7 @@ def _places(found: Any) -> Iterator[tuple[Any, Any]]:
 @pytest.mark.parametrize("value", ["x", [1, 2], {}, None, -1, 10**400, float("nan")], ids=repr)
 def test_any_field_of_a_signed_file_may_hold_anything(tmp_path: Path, value: Any) -> None:
     path, arrays = tmp_path / "policy.npz", policies.arrays()
-    trained = {"format": 2, **policy_meta(load_train(["stage=s1"]), update=1, seed=0)}
+    trained = {"format": FORMAT, **policy_meta(load_train(["stage=s1"]), update=1, seed=0)}
     places = [_places(part) for name, part in trained.items() if name in _READ]
     for where, key in itertools.chain(*places):
         before, where[key] = where[key], value

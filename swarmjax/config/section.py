@@ -22,11 +22,16 @@ _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
 _MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
 _MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
 _MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
+LAST_READER = "d8b3078"  # the last commit that reads runs and policies of older versions
 _SHOWN = 80  # letters of a value to show in a message
 
 
 class ConfigError(ValueError):
     """Tells the user in one sentence why a setting is refused."""
+
+
+class UnknownKeyError(ConfigError):
+    """Refuses a key that does not exist."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Bounds:
         return ", ".join(given) or "any finite number"
 
 
-def about(  # noqa: PLR0913  # most calls give two or three
+def about(  # most calls give two or three
     meaning: str,
     low: float = -math.inf,
     high: float = math.inf,
@@ -79,7 +84,6 @@ def about(  # noqa: PLR0913  # most calls give two or three
     below: float = math.inf,
     derived: bool = False,
     stored: bool = True,
-    renamed: Mapping[str, str] | None = None,
     reason: str = "",
 ) -> dict[str, Any]:
     """Returns the metadata of a field.
@@ -92,12 +96,10 @@ def about(  # noqa: PLR0913  # most calls give two or three
       below: a number that the value must stay below.
       derived: whether the chosen files determine the value, so that the command line cannot set it.
       stored: whether `to_dict` keeps the field. Fields that are not kept are computed again.
-      renamed: new names of values, by old name.
       reason: why `high` is the limit and how to raise it, for the error message.
     """
     bounds = Bounds(low, high, above, below, reason)
-    found = {"meaning": meaning, "bounds": bounds, "renamed": renamed or {}}
-    return found | {"derived": derived, "stored": stored}
+    return {"meaning": meaning, "bounds": bounds, "derived": derived, "stored": stored}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,15 +108,11 @@ class Section:
 
     Attributes:
       command: name of the command's file in configs/, if the section holds all keys of a command.
-      removed: why a key was removed, by its old name.
-      renamed: new names of keys, by old name.
       inherited: for each section by name, where its values come from if no word sets them.
       shared: the keys and sections that a file for the whole config, such as a recipe, may set.
     """
 
     command: ClassVar[str] = ""
-    removed: ClassVar[Mapping[str, str]] = {}
-    renamed: ClassVar[Mapping[str, str]] = {}
     inherited: ClassVar[Mapping[str, str]] = {}
     shared: ClassVar[tuple[str, ...]] = ()
 
@@ -204,8 +202,6 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
     for item in known.values():
         if item.name not in mapping and _is_required(item):
             raise ConfigError(f"{where}{item.name} is missing and has no default: give it.")
-    for key, value in mapping.items():
-        _refuse_renamed(known[key], value, f"{where}{key}")
     values = {
         key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()
     }
@@ -215,12 +211,26 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
         raise ConfigError(f"{where}{error}") from None
 
 
-def _refuse_renamed(item: dataclasses.Field[Any], value: object, key: str) -> None:
-    """Refuses a value's old name, and names the new one."""
-    renamed = item.metadata.get("renamed", {})
-    if isinstance(value, str) and value in renamed:
-        new = renamed[value]
-        raise ConfigError(f"{key} is {value}, which is called {new} now: give {new}.")
+def build_stored[C: Section](cls: type[C], stored: Any, where: str) -> C:
+    """Makes a section as `build` does, from what a run directory or a policy holds.
+
+    Args:
+      cls: the dataclass to make.
+      stored: the result of `to_dict`, perhaps of an older version.
+      where: the prefix of the keys in messages.
+
+    Raises:
+      ConfigError: as `build`; for a key that this version lacks, it names the last commit that
+        reads it.
+    """
+    try:
+        return build(cls, stored, where)
+    except UnknownKeyError as error:
+        key = str(error).partition(" is not a key: ")[0]
+        raise ConfigError(
+            f"{key} is not a key: if an older version wrote it, {LAST_READER} is the last commit "
+            "that reads it."
+        ) from None
 
 
 def to_dict(config: Section) -> dict[str, Any]:
@@ -231,40 +241,6 @@ def to_dict(config: Section) -> dict[str, Any]:
         if item.metadata.get("stored", True):
             found[item.name] = _plain(value)
     return found
-
-
-def modernise(cls: type[Section], stored: Any) -> Any:
-    """Translates stored settings to the names of this version, so that `build` accepts them.
-
-    Args:
-      cls: their section.
-      stored: plain data of this version or an older one.
-
-    Returns:
-      The same data with new names of keys and values, and without removed keys. Data that is not a
-      section is returned unchanged, and `build` will refuse it.
-    """
-    if not isinstance(stored, Mapping):
-        return stored
-    fields = {item.name: item for item in dataclasses.fields(cls)}
-    found = {}
-    for old, value in stored.items():
-        key = cls.renamed.get(old, old)
-        if key in fields:
-            found[key] = _modernise_value(fields[key], value)
-        elif key not in cls.removed:
-            found[key] = value
-    return found
-
-
-def _modernise_value(item: dataclasses.Field[Any], value: Any) -> Any:
-    inner = _section(item.type)
-    if inner is not None and isinstance(value, list | tuple):
-        return [modernise(inner, each) for each in value]
-    if inner is not None:
-        return modernise(inner, value)
-    renamed = item.metadata.get("renamed", {})
-    return renamed.get(value, value) if isinstance(value, str) else value
 
 
 def _plain(value: object) -> object:
@@ -375,23 +351,12 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
       cls: the section that has no such key.
       where: the prefix of the key, such as `sim.`.
     """
-    if key in cls.removed:
-        return ConfigError(f"{where}{key} is no longer a key: {cls.removed[key]}")
-    if key in cls.renamed:
-        new = cls.renamed[key]
-        return ConfigError(f"{where}{key} is called {where}{new} now: give {where}{new}.")
     known = names(cls)
     dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
-    once = {name: name for name in known} | dict(cls.renamed)
-    near = [dotted[key]] if key in dotted else _near(key, once)
-    near = near or _near(key, dotted)
+    near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)
+    near = near or [dotted[name] for name in difflib.get_close_matches(key, dotted, n=1)]
     hint = f"did you mean {where}{near[0]}?" if near else f"give one of {', '.join(known)}."
-    return ConfigError(f"{where}{key} is not a key: {hint}")
-
-
-def _near(key: str, meant: Mapping[str, str]) -> list[str]:
-    """Returns the meaning of the name nearest to a key, if one is near."""
-    return [meant[name] for name in difflib.get_close_matches(key, meant, n=1)]
+    return UnknownKeyError(f"{where}{key} is not a key: {hint}")
 
 
 def _is_derived(item: dataclasses.Field[Any]) -> bool:

@@ -1,9 +1,7 @@
 """Judges policies on the training device and in the training engine, many arenas at once.
 
-The levels are the same as in `swarmjax.evaluate`: the same function draws them from the same seed.
-The rules and figures are the same too. The engine differs: it is the training engine, with its
-analytic sensors and few solver steps. Published results come from MuJoCo C. This engine is cheap.
-That suits studies that judge policies again and again while the policies learn.
+Levels, rules and figures are those of the other engine. This one is the training engine, with its
+analytic sensors and few solver steps. Published results come from MuJoCo C; this engine is cheap.
 """
 
 import functools
@@ -25,93 +23,20 @@ from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import networks
-from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import LearnerState
 from swarmjax.ppo.memory import remember
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
-from swarmjax.task import electronics, env, level, placement
+from swarmjax.task import electronics, env
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.env import EnvState, World
-from swarmjax.task.level import Level, Spacing
+from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
 LARGEST_BOX = 0.3  # m; largest size of a box that a stage allows
 _ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
-
-
-class Outcomes(NamedTuple):
-    """The outcomes of episodes, [E] each; the first four have the names of `measures.per_level`.
-
-    Attributes:
-      targets_reached: share of targets reached, 0..1.
-      all_reached: 1 if every robot arrived, else 0.
-      contacts_per_robot: contacts of all kinds per robot.
-      episode_time_s: time until all robots arrived or the time was out, s.
-      broken: 1 if the episode ended because the physics stopped being finite, else 0.
-    """
-
-    targets_reached: Array
-    all_reached: Array
-    contacts_per_robot: Array
-    episode_time_s: Array
-    broken: Array
-
-
-def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> Level:
-    """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
-
-    Args:
-      world: the compiled environment. Its config has this stage, or a stage with obstacles of the
-        same size.
-      stage: stage of the levels.
-      seed: seed of the evaluation.
-      episodes: E.
-
-    Returns:
-      [E] levels, as NumPy arrays. Robots and obstacles that the stage lacks are parked outside.
-
-    Raises:
-      ConfigError: the stage has more robots or obstacles than the world is compiled for.
-    """
-    for key in ("robots", "obstacles"):
-        value, most = getattr(stage, key), getattr(world.spacing, key)
-        if value > most:
-            raise ConfigError(
-                f"stage {stage.name}: {key} is {value}, but sim.max_{key} is {most}: give "
-                f"sim.max_{key}={value} or more."
-            )
-    one = task_stage.single(stage, world.drawings)
-    spacing = world.spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
-    drawn = [
-        _make_room(judge.draw_level(one, spacing, seed, episode, world.drawings), world.spacing)
-        for episode in range(episodes)
-    ]
-    return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
-
-
-def _make_room(drawn: Level, spacing: Spacing) -> Level:
-    """Adds absent robots and obstacles to a level, and parks them."""
-    robots = spacing.robots - len(drawn.present)
-    obstacles = spacing.obstacles - len(drawn.obstacle_present)
-
-    def widened(x: np.ndarray, more: int, fill: ArrayLike = 0) -> np.ndarray:
-        return np.concatenate([x, np.full((more, *x.shape[1:]), fill, x.dtype)])
-
-    wider = drawn._replace(
-        present=widened(drawn.present, robots),
-        start=widened(drawn.start, robots),
-        target=widened(drawn.target, robots),
-        obstacle_present=widened(drawn.obstacle_present, obstacles),
-        # Parked obstacles need edges too, although no robot meets these obstacles.
-        obstacle=widened(drawn.obstacle, obstacles, (0, 0, 0, placement.MARGIN, placement.MARGIN)),
-    )
-    return level.park(wider, np)
 
 
 def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
@@ -176,7 +101,7 @@ def play(
     run = _program(
         world,
         steps,
-        (trained.encoding, trained.history, trained.meta["observation"]["limit"]),
+        (trained.encoding, trained.meta["observation"]["limit"]),
         judge.neighbours(trained),
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
@@ -198,7 +123,7 @@ def play(
 def _program(
     world: World,
     steps: int,
-    seen: tuple[electronics.Encoding, int, float],
+    seen: tuple[electronics.Encoding, float],
     heard: NeighboursConfig,
     limits: tuple[float, float],
     activation: str,
@@ -206,11 +131,11 @@ def _program(
     network: Any,
 ) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
     """Compiles the program for policies that differ only in their weights."""
-    (encoding, history, limit), (speed, turn_rate) = seen, limits
+    (encoding, limit), (speed, turn_rate) = seen, limits
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        task=replace(world.task, history=history, neighbours=heard),
+        task=replace(world.task, neighbours=heard),
         electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
     )
 
@@ -218,7 +143,7 @@ def _program(
         mean = partial(_mean_action, activation, limit, weights, network, heard.count)
         act = partial(_act, mean, log_std if sampled else None)
         memory = _begin(weights[-1], levels.present.shape)
-        arenas, counts, broken = _run(mine, act, levels, steps, memory)
+        arenas, counts, broken = run(mine, act, levels, steps, memory)
         return _outcome(arenas, counts), broken
 
     return jax.jit(play)
@@ -287,62 +212,6 @@ def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array
     return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
 
 
-def outcomes(
-    world: World,
-    config: AlgoConfig,
-    learners: LearnerState,
-    levels: Level,
-    steps: int,
-    *,
-    sampled: bool = False,
-) -> Outcomes:
-    """Runs an episode of each level with policies in training.
-
-    The function is pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the
-    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
-    together (E, or E times the number of seeds), because MJX-Warp sizes its memory of contacts for
-    that number. The world's `task.step_limit` is ignored.
-
-    Args:
-      world: the compiled environment.
-      config: the config that made the learners.
-      learners: [L].
-      levels: [E].
-      steps: control steps of an episode, at least 1.
-      sampled: whether to draw the actions from the policies; otherwise they are their means.
-
-    Returns:
-      [E] outcomes. If the physics of an episode breaks, the episode ends at that step, and its
-      robots stay where they were before the step.
-    """
-    act = partial(_choose, config, learners, sampled=sampled)
-    memory = networks.begin_memory(config, levels.present.shape)
-    first = None if memory is None else memory.actor
-    arenas, _, broken = _run(world, act, levels, steps, first)
-    return _sum_up(arenas, broken, world.task.control_step)
-
-
-def _choose(
-    config: AlgoConfig, learners: LearnerState, memory: Any, arenas: EnvState, *, sampled: bool
-) -> tuple[Any, Array]:
-    """Returns the learners' actions [E, R, U], drawn as in the judge, or their means."""
-    count = len(jax.tree.leaves(learners)[0])
-    seen = rollout.to_learners(arenas.observation, count)
-    mine = None if memory is None else rollout.to_learners(memory, count)
-    if sampled:
-        actions = learners.params["actor"]["log_std"].shape[-1]
-        shape = (arenas.observation.shape[-2], actions)
-        drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
-        action, _, after = jax.vmap(
-            lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)
-        )(learners, seen, rollout.to_learners(drawn, count), mine)
-    else:
-        action, after = jax.vmap(lambda learner, o, m: ppo.recall_mode(learner, config, o, m))(
-            learners, seen, mine
-        )
-    return None if after is None else rollout.to_arenas(after), rollout.to_arenas(action)
-
-
 class _Counts(NamedTuple):
     """Counts of `Outcome` that training does not need, [E, R, ...]; `anchor` is as in the judge."""
 
@@ -354,13 +223,25 @@ class _Counts(NamedTuple):
 
 
 # Takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
-_Actor = Callable[[Any, EnvState], tuple[Any, Array]]
+Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 
 
-def _run(
-    world: World, act: _Actor, levels: Level, steps: int, memory: Array | None
+def run(
+    world: World, act: Actor, levels: Level, steps: int, memory: Array | None
 ) -> tuple[EnvState, _Counts, Array]:
-    """Runs an episode of each level; returns final arenas, counts, and whether each arena broke."""
+    """Runs an episode of each level.
+
+    Args:
+      world: the compiled environment.
+      act: takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
+      levels: [E].
+      steps: control steps of an episode, at least 1.
+      memory: memory at the start.
+
+    Returns:
+      The final arenas, counts, and whether the physics of each arena broke. Such an episode ends,
+      and its robots stay where they were before the step.
+    """
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
     chex.assert_shape(levels.obstacle, (len(levels.side), obstacles, 5))
@@ -383,7 +264,7 @@ _Carry = tuple[EnvState, _Counts, Array, Array | None]
 
 def _step(
     world: World,
-    act: _Actor,
+    act: Actor,
     carry: _Carry,
     _: None,
 ) -> tuple[_Carry, None]:
@@ -441,18 +322,3 @@ def _outcome(arenas: EnvState, counts: _Counts) -> dict[str, Array]:
 def _all_arrived(arenas: EnvState) -> Array:
     """Returns [E] whether every robot of the arena has arrived."""
     return jnp.all(arenas.arrived | ~arenas.level.present, axis=-1)
-
-
-def _sum_up(arenas: EnvState, broken: Array, control_step: float) -> Outcomes:
-    """Summarises episodes as `measures.per_level` does."""
-    present = arenas.level.present
-    robots = jnp.sum(present, axis=-1)
-    reached = jnp.sum(present & arenas.arrived, axis=-1)
-    contacts = jnp.sum(arenas.episode.contacts, axis=(-2, -1))
-    return Outcomes(
-        targets_reached=reached / robots,
-        all_reached=(reached == robots).astype(jnp.float32),
-        contacts_per_robot=contacts / robots,
-        episode_time_s=arenas.clock * jnp.float32(control_step),
-        broken=broken.astype(jnp.float32),
-    )

@@ -1,4 +1,4 @@
-"""Point estimates and their intervals, with NumPy alone (`curves.py` has learning curves).
+"""Point estimates and their intervals, with NumPy alone.
 
 Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
@@ -15,21 +15,16 @@ draw               each resample                               the interval is a
                    rliable does (stratified by task)           task by itself
 `runs`             draws runs with all their tasks             other runs, each judged on all
                                                                these tasks
-`tasks_per_run`    draws tasks for each run by itself          these runs, each on other tasks of
-                                                               its own
 `tasks`            draws tasks with all their runs             these runs, all on the same other
                                                                tasks
-`runs_then_tasks`  draws runs, then tasks for each by itself   other runs, each on other tasks of
-                                                               its own
 `runs_and_tasks`   draws runs, and tasks for all of them       other runs, all on the same other
                                                                tasks
 =================  ==========================================  ==================================
 
 Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
-the same levels, a hard level is hard for all of them, but `tasks_per_run` would average this
-difficulty out over the runs. The last two draws err on the wide side, because they count the spread
-of single values twice (Davison & Hinkley 1997, "Bootstrap Methods and their Application", section
-3.8; Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
+the same levels, a hard level is hard for all of them, and drawing levels for each run would average
+this difficulty out. The last draw errs on the wide side, because it counts the spread of single
+values twice (Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
 
 Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
 than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
@@ -47,20 +42,16 @@ from numpy.typing import ArrayLike
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
 # With two runs, half of all resamples hold one run twice, so the interval would just span both.
 LEAST_DRAWN = 3
+CONFIDENCE = 0.95  # of every interval
+RESAMPLES = 2000
 _LAST_TWO = (-2, -1)
 
-type RunDraw = Literal["runs_per_task", "runs"]
-type SharedDraw = Literal["tasks", "runs_and_tasks"]
-type Draw = RunDraw | SharedDraw | Literal["tasks_per_run", "runs_then_tasks"]
-# How a draw treats runs and tasks. It may keep them, or draw them whole. It may also draw runs
-# separately for each task, or tasks separately for each run.
-_DRAWS = {
-    "runs_per_task": ("each", "kept"),
-    "runs": ("whole", "kept"),
-    "tasks_per_run": ("kept", "each"),
-    "tasks": ("kept", "whole"),
-    "runs_then_tasks": ("whole", "each"),
-    "runs_and_tasks": ("whole", "whole"),
+type Draw = Literal["runs_per_task", "runs", "tasks", "runs_and_tasks"]
+_DRAWN = {  # what a draw draws
+    "runs_per_task": ("runs",),
+    "runs": ("runs",),
+    "tasks": ("tasks",),
+    "runs_and_tasks": ("runs", "tasks"),
 }
 
 
@@ -151,8 +142,7 @@ def bootstrap(
     *,
     draw: Draw = "runs_per_task",
     strata: Sequence[int] | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
+    resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Interval[float]:
     """Computes a percentile interval of a statistic (Efron & Tibshirani 1993, chapter 13).
@@ -170,9 +160,7 @@ def bootstrap(
       draw: the part to draw, and therefore what the interval is about.
       strata: sizes of groups of consecutive tasks; tasks are drawn within each group (Efron &
         Tibshirani 1993, section 8.3). None draws among all tasks.
-      confidence: confidence of the interval, above 0 and below 1.
-      resamples: number of resamples, so large that at least one lies beyond each end of the
-        interval.
+      resamples: number of resamples; 40 or more, so that one lies beyond each end of the interval.
       seed: seed of the draws.
 
     Returns:
@@ -181,11 +169,9 @@ def bootstrap(
     Raises:
       ValueError: an argument is refused, or the statistic gives nan or another shape.
     """
-    table = checked_table("values", values, draw)
-    _check_resampling(confidence, resamples)
-    _check_strata(strata, table.shape[1])
-    draws = _distributions((table,), statistic, draw, resamples, seed, strata)[0]
-    return _interval(float(_apply(statistic, table)), draws, confidence)
+    table = _table("values", values, draw)
+    draws = _distributions((table,), statistic, _Resampling(draw, strata, resamples, seed))[0]
+    return _interval(float(_apply(statistic, table)), draws)
 
 
 def paired(
@@ -195,9 +181,7 @@ def paired(
     *,
     draw: Draw = "runs_per_task",
     strata: Sequence[int] | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    resamples: int = RESAMPLES,
 ) -> Interval[float]:
     """Computes the interval of a difference: the statistic of b minus the statistic of a.
 
@@ -210,9 +194,7 @@ def paired(
       statistic: as in `bootstrap`.
       draw: as in `bootstrap`.
       strata: as in `bootstrap`.
-      confidence: as in `bootstrap`.
       resamples: as in `bootstrap`.
-      seed: seed of the draws.
 
     Returns:
       Difference and interval, in the unit of the statistic.
@@ -220,7 +202,7 @@ def paired(
     Raises:
       ValueError: as in `bootstrap`, and if the shapes differ or a value is inf.
     """
-    before, after = checked_table("a", a, draw), checked_table("b", b, draw)
+    before, after = _table("a", a, draw), _table("b", b, draw)
     if before.shape != after.shape:
         raise ValueError(f"a is {before.shape} and b is {after.shape}: give pairs of equal shapes.")
     for name, table in (("a", before), ("b", after)):
@@ -228,22 +210,19 @@ def paired(
             raise ValueError(
                 f"{name} holds inf, and inf - inf is no number: use probability_of_improvement."
             )
-    _check_resampling(confidence, resamples)
-    _check_strata(strata, before.shape[1])
-    of_a, of_b = _distributions((before, after), statistic, draw, resamples, seed, strata)
+    resampling = _Resampling(draw, strata, resamples)
+    of_a, of_b = _distributions((before, after), statistic, resampling)
     estimate = float(_apply(statistic, after)) - float(_apply(statistic, before))
-    return _interval(estimate, of_b - of_a, confidence)
+    return _interval(estimate, of_b - of_a)
 
 
 def probability_of_improvement(
     a: ArrayLike,
     b: ArrayLike,
     *,
-    draw: RunDraw | SharedDraw = "runs_per_task",
+    draw: Draw = "runs_per_task",
     strata: Sequence[int] | None = None,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    resamples: int = RESAMPLES,
 ) -> Interval[float]:
     """Computes the interval of the probability that a beats b: P(a > b) + P(a = b) / 2.
 
@@ -256,38 +235,55 @@ def probability_of_improvement(
       a: [n, tasks] values in any unit; at least three runs if runs are drawn, and at least three
         tasks if tasks are drawn.
       b: [m, tasks] of the same unit.
-      draw: `runs_per_task`, `runs`, `tasks` or `runs_and_tasks`, as in `bootstrap`.
+      draw: as in `bootstrap`.
       strata: as in `bootstrap`.
-      confidence: as in `bootstrap`.
       resamples: as in `bootstrap`.
-      seed: seed of the draws.
 
     Returns:
       Probability and interval, 0 to 1.
 
     Raises:
-      ValueError: as in `bootstrap`, and if tasks differ in number or are drawn for each run.
+      ValueError: as in `bootstrap`, and if tasks differ in number.
     """
-    if draw not in ("runs_per_task", "runs", "tasks", "runs_and_tasks"):
-        raise ValueError(f"draw is '{draw}': give runs_per_task, runs, tasks or runs_and_tasks.")
-    ours, theirs = checked_table("a", a, draw), checked_table("b", b, draw)
+    ours, theirs = _table("a", a, draw), _table("b", b, draw)
     if ours.shape[1] != theirs.shape[1]:
         raise ValueError(
             f"a has {ours.shape[1]} tasks and b has {theirs.shape[1]}: give the same number of "
             "tasks."
         )
-    _check_resampling(confidence, resamples)
-    _check_strata(strata, ours.shape[1])
     wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
-    random = np.random.default_rng(seed)
-    draws = []
-    for count in _blocks(resamples, wins.size):
-        mine, tasks = _indices(random, draw, count, ours.shape, strata)
-        other, _ = _indices(random, draw, count, theirs.shape, strata)
+    resampling, random, draws = _Resampling(draw, strata, resamples), np.random.default_rng(0), []
+    for count in resampling.blocks(wins.size):
+        mine, tasks = resampling.indices(random, count, ours.shape)
+        other, _ = resampling.indices(random, count, theirs.shape)
         # Axes: resamples, runs of a, runs of b, tasks. An axis that is not drawn has one resample.
-        found = wins[mine[..., :, None, :], other[..., None, :, :], _widen(tasks)]
-        draws.append(found.mean(axis=(1, 2, 3)))
-    return _interval(float(wins.mean()), np.concatenate(draws), confidence)
+        drawn = wins[mine[..., :, None, :], other[..., None, :, :], tasks[..., None, :]]
+        draws.append(drawn.mean(axis=(1, 2, 3)))
+    return _interval(float(wins.mean()), np.concatenate(draws))
+
+
+def curve(
+    values: ArrayLike, statistic: Statistic = iqm, *, resamples: int = RESAMPLES
+) -> Interval[np.ndarray]:
+    """Computes the interval of a statistic over runs at each point of their curves.
+
+    All points use the same draws, so each drawn run contributes its whole curve. The confidence
+    holds for each point by itself, not for all points at once.
+
+    Args:
+      values: [runs, points] values in any unit, of at least three runs.
+      statistic: as in `bootstrap`, called on [..., runs, 1].
+      resamples: as in `bootstrap`.
+
+    Returns:
+      Estimates and intervals [points].
+
+    Raises:
+      ValueError: As in `bootstrap`.
+    """
+    columns = _table("values", values, "runs").T[..., None]
+    points = [bootstrap(each, statistic, draw="runs", resamples=resamples) for each in columns]
+    return Interval(*np.array(points).T)
 
 
 def checked(name: str, x: ArrayLike) -> np.ndarray:
@@ -312,116 +308,86 @@ def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
     return moved.reshape(*moved.shape[: values.ndim - len(axes)], -1)
 
 
-def checked_table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
+def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     """Converts numbers [runs, tasks]; refuses too few runs or tasks to draw from."""
-    if draw not in _DRAWS:
-        raise ValueError(f"draw is '{draw}': give one of {', '.join(_DRAWS)}.")
+    if draw not in _DRAWN:
+        raise ValueError(f"draw is '{draw}': give one of {', '.join(_DRAWN)}.")
     values = checked(name, x)
     if values.ndim != 2:
         raise ValueError(f"{name} has shape {values.shape}: give [runs, tasks].")
-    for what, how, count in zip(("runs", "tasks"), _DRAWS[draw], values.shape, strict=True):
-        if how != "kept" and count < LEAST_DRAWN:
+    for what, count in zip(("runs", "tasks"), values.shape, strict=True):
+        if what in _DRAWN[draw] and count < LEAST_DRAWN:
             raise ValueError(
                 f"{name} has {count} {what}: an interval over {what} needs {LEAST_DRAWN} or more."
             )
     return values
 
 
-def _check_resampling(confidence: float, resamples: int) -> None:
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence is {confidence}: give more than 0 and less than 1.")
-    # The small number allows for rounding: 20 * (1 - 0.9) is 1.9999999999999996.
-    if resamples * (1 - confidence) < 2 - 1e-9:
-        raise ValueError(
-            f"resamples is {resamples}: too few for confidence {confidence}. Give more resamples "
-            "or a lower confidence."
-        )
+class _Resampling(NamedTuple):
+    """How values [runs, tasks] are drawn; the fields are arguments of `bootstrap`."""
 
+    draw: str
+    strata: Sequence[int] | None
+    resamples: int
+    seed: int = 0
 
-def _blocks(resamples: int, cells: int) -> Iterator[int]:
-    """Splits resamples, with the given number of values each, into blocks that fit the memory."""
-    block = max(1, BLOCK // cells)
-    for first in range(0, resamples, block):
-        yield min(block, resamples - first)
+    def blocks(self, cells: int) -> Iterator[int]:
+        """Splits resamples, with this number of values each, into blocks that fit the memory."""
+        block = max(1, BLOCK // cells)
+        for first in range(0, self.resamples, block):
+            yield min(block, self.resamples - first)
 
+    def indices(
+        self, random: np.random.Generator, count: int, shape: tuple[int, ...]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draws indices of values: two arrays that broadcast to [count, runs, tasks]."""
+        runs, tasks = shape
+        row, column = np.arange(runs)[:, None], np.arange(tasks)[None]
+        if "runs" in _DRAWN[self.draw]:
+            each = tasks if self.draw == "runs_per_task" else 1
+            row = random.integers(runs, size=(count, runs, each))
+        if "tasks" in _DRAWN[self.draw]:
+            column = random.integers(*self._group(tasks), size=(count, 1, tasks))
+        return row, column
 
-def _indices(
-    random: np.random.Generator,
-    draw: str,
-    count: int,
-    shape: tuple[int, ...],
-    strata: Sequence[int] | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws indices of values [runs, tasks]: two arrays that broadcast to [count, runs, tasks]."""
-    by_run, by_task = _DRAWS[draw]
-    runs, tasks = shape
-    row, column = np.arange(runs)[:, None], np.arange(tasks)
-    if by_run != "kept":
-        row = random.integers(runs, size=(count, runs, tasks if by_run == "each" else 1))
-    if by_task != "kept":
-        low, high = _bounds(strata, tasks)
-        size = (count, runs if by_task == "each" else 1, tasks)
-        column = random.integers(low, high, size=size)
-    return row, column
-
-
-def _bounds(strata: Sequence[int] | None, tasks: int) -> tuple[Any, Any]:
-    """Returns the bounds of the group that each task is drawn from."""
-    if strata is None:
-        return 0, tasks
-    ends = np.cumsum(strata)
-    return np.repeat(ends - strata, strata), np.repeat(ends, strata)
-
-
-def _check_strata(strata: Sequence[int] | None, tasks: int) -> None:
-    if strata is not None and (min(strata, default=0) < LEAST_DRAWN or sum(strata) != tasks):
-        raise ValueError(
-            f"strata is {list(strata)}: give numbers of {LEAST_DRAWN} or more that add up to "
-            f"{tasks}."
-        )
-
-
-def _widen(tasks: np.ndarray) -> np.ndarray:
-    """Adds an axis for another table's runs to indices of tasks [tasks] or [count, 1, tasks]."""
-    return tasks if tasks.ndim == 1 else tasks[:, :, None]
+    def _group(self, tasks: int) -> tuple[Any, Any]:
+        """Returns the bounds of the group that each task is drawn from."""
+        if self.strata is None:
+            return 0, tasks
+        ends = np.cumsum(self.strata)
+        return np.repeat(ends - self.strata, self.strata), np.repeat(ends, self.strata)
 
 
 def _distributions(
-    tables: tuple[np.ndarray, ...],
-    statistic: Statistic,
-    draw: str,
-    resamples: int,
-    seed: int,
-    strata: Sequence[int] | None = None,
+    tables: tuple[np.ndarray, ...], statistic: Statistic, resampling: _Resampling
 ) -> np.ndarray:
     """Computes statistics [tables, resamples] of tables of one shape, all with the same draws."""
-    random = np.random.default_rng(seed)
-    found = []
-    for count in _blocks(resamples, tables[0].size):
-        index = _indices(random, draw, count, tables[0].shape, strata)
-        found.append([_apply(statistic, table[index]) for table in tables])
-    return np.concatenate(found, axis=1)
+    random, drawn = np.random.default_rng(resampling.seed), []
+    for count in resampling.blocks(tables[0].size):
+        index = resampling.indices(random, count, tables[0].shape)
+        drawn.append([_apply(statistic, table[index]) for table in tables])
+    return np.concatenate(drawn, axis=1)
 
 
 def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
     """Computes statistics [...] of x [..., runs, tasks]."""
-    found = np.asarray(statistic(x, axis=_LAST_TWO))
-    if found.shape != x.shape[:-2]:
+    values = np.asarray(statistic(x, axis=_LAST_TWO))
+    if values.shape != x.shape[:-2]:
         raise ValueError(
-            f"statistic of values of shape {x.shape} has shape {found.shape}: give {x.shape[:-2]}."
+            f"statistic of values of shape {x.shape} has shape {values.shape}: give {x.shape[:-2]}."
         )
-    if np.isnan(found).any():
+    if np.isnan(values).any():
         raise ValueError("statistic gives nan for values without nan.")
-    return found
+    return values
 
 
-def _interval(estimate: float, draws: np.ndarray, confidence: float) -> Interval[float]:
+def _interval(estimate: float, draws: np.ndarray) -> Interval[float]:
     """Computes the percentile interval of draws [resamples].
 
     The interval's ends are draws, never mixtures of two draws, because a mixture of inf and inf
     would be nan.
     """
     last = len(draws) - 1
-    low = math.floor((1 - confidence) / 2 * last)
+    low = math.floor((1 - CONFIDENCE) / 2 * last)
     ordered = np.partition(draws, (low, last - low))
     return Interval(estimate, float(ordered[low]), float(ordered[last - low]))

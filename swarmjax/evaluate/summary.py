@@ -14,7 +14,7 @@ from swarmjax.evaluate import judge, statistics
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import MEASURES, Measure
-from swarmjax.evaluate.statistics import LEAST_DRAWN, Interval, SharedDraw, Statistic
+from swarmjax.evaluate.statistics import LEAST_DRAWN, Draw, Interval, Statistic
 from swarmjax.evaluate.trials import Entrant, Trial, specialise
 
 WORST = 0.05  # share of the levels that CVaR averages
@@ -150,7 +150,7 @@ def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
     return min(strata or [table.shape[1]]) >= LEAST_DRAWN
 
 
-def _draw(table: np.ndarray) -> SharedDraw:
+def _draw(table: np.ndarray) -> Draw:
     """Chooses what to draw.
 
     All policies have the same levels. If there are few policies, only levels are drawn.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from swarmjax import policy_file
 from swarmjax.config import ConfigError, Section, build, files, inherit
-from swarmjax.config.section import modernise
+from swarmjax.config.section import build_stored
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
@@ -25,7 +25,7 @@ _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
 _TOLD = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 # Each policy has its own values of these keys, because they determine its network's inputs.
-_OWN = ("task.history", *(f"task.neighbours.{key}" for key in ("count", "range", "message_size")))
+_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range", "message_size"))
 
 
 class Trained(NamedTuple):
@@ -45,7 +45,7 @@ class Trained(NamedTuple):
 
 
 def trained(meta: Mapping[str, Any], path: str) -> Trained:
-    """Reads the conditions of training from a policy file; older files have fewer of them.
+    """Reads the conditions of training from a policy file.
 
     Args:
       meta: Contents of the file's `meta`.
@@ -54,34 +54,19 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     Raises:
       ConfigError: A number is unsound.
     """
-    config = {key: value for key, value in meta["config"].items() if isinstance(value, Mapping)}
-    low, high = meta["action"]["low"], meta["action"]["high"]
-    robot = {
-        "max_speed": high[0],
-        "max_turn_rate": -low[1],
-        **modernise(RobotConfig, config.get("robot", {})),
-        **_known(RobotConfig, meta["robot"]),
-    }
+    names = {item.name for item in fields(RobotConfig)}
+    robot = {key: value for key, value in meta["robot"].items() if key in names}
+    robot["max_speed"], robot["max_turn_rate"] = meta["action"]["high"][:2]
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
-    task["history"] = meta["observation"].get("history", 1)
     if "neighbours" in meta["observation"]:
         task["neighbours"] = meta["observation"]["neighbours"]
-    sensors = {"infrared": meta["sensors"]["response"], "name": meta["sensors"]["preset"]}
-    realism = meta.get("realism") or config.get("realism") or sensors
-    stages = meta.get("stages") or meta["config"].get("stage") or []
     return Trained(
         robot=build(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),
-        realism=build(RealismConfig, modernise(RealismConfig, realism), f"{path}: meta.realism."),
-        stages=[stages] if isinstance(stages, dict) else list(stages),
+        realism=build_stored(RealismConfig, meta["realism"], f"{path}: meta.realism."),
+        stages=meta["stages"],
     )
-
-
-def _known(cls: type[Section], mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """Keeps the keys that a section has."""
-    names = {item.name for item in fields(cls)}
-    return {key: value for key, value in mapping.items() if key in names}
 
 
 def load[C: Section](
@@ -164,9 +149,9 @@ def _check_alike(
 
 
 def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
-    """Refuses settings with another history or hearing than the first policy's.
+    """Refuses settings with another hearing than the first policy's.
 
-    Each policy is judged with its own history and hearing, since its network accepts no others.
+    Each policy is judged with its own hearing, since its network accepts no other.
     """
     for path, each in list(found.items())[:1]:
         for key in _OWN:

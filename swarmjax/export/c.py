@@ -23,7 +23,7 @@ _ACTIVATIONS = {
 
 _MEMORY_TYPE = """#define POLICY_MEMORY SIZE
 
-/* WHAT */
+/* The memory of a robot. */
 typedef struct {
     float recalled[POLICY_MEMORY];
 } PolicyMemory;
@@ -48,19 +48,6 @@ static void remember(unsigned learner, const float *features, float *recalled)
         const unsigned update = POLICY_MEMORY + i, candidate = 2 * POLICY_MEMORY + i;
         const float fresh = tanhf(seen[candidate] + logistic(seen[i] + old[i]) * old[candidate]);
         recalled[i] = fresh + logistic(seen[update] + old[update]) * (recalled[i] - fresh);
-    }
-}
-
-"""
-# The observations of a history, newest first. The history is zero at the start of an episode, as in
-# `policy.step`.
-_HISTORY_CODE = """static void remember(const float *observation, float *recalled)
-{
-    for (unsigned i = POLICY_MEMORY; i-- > POLICY_OBSERVATIONS;) {
-        recalled[i] = recalled[i - POLICY_OBSERVATIONS];
-    }
-    for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
-        recalled[i] = observation[i];
     }
 }
 
@@ -94,12 +81,6 @@ _BEGIN_CODE = """void policy_begin(PolicyMemory *memory)
     }
 }
 
-"""
-_HISTORY_CALL = """    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
-        const unsigned entry = POLICY_OBSERVATIONS + i;
-        a[entry] = clip((memory->recalled[i] - MEAN[learner][entry]) / STD[learner][entry], LIMIT);
-    }
-    remember(observation, memory->recalled);
 """
 _MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
             policy_begin(&memory[i % POLICY_LEARNERS]);
@@ -148,13 +129,13 @@ def _about(trained: Policy) -> dict[str, str]:
         "control_step_f": number(task["control_step"]),
         "target_radius_f": number(task["target_radius"]),
         "holds": str(int(export_layout.holds(trained))),
-        "observations": str(_seen(trained)),
+        "observations": str(trained.mean.shape[1]),
         "actions": str(sizes[-1]),
         "learners": str(learners),
         **{key: short(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
         "parameters": f"{parameters:,}",
         "flash": f"{4 * parameters:,}",
-        "stack": f"{2 * 4 * (_widest(trained) + 3 * _recalled(trained)):,}",
+        "stack": f"{2 * 4 * (_widest(trained) + 3 * trained.carried):,}",
     }
 
 
@@ -172,20 +153,10 @@ def _first(trained: Policy) -> int:
     return trained.mean.shape[1] - trained.neighbours["count"] * trained.hearing[0].shape[1]
 
 
-def _seen(trained: Policy) -> int:
-    """Returns the size of one observation."""
-    return trained.mean.shape[1] // trained.history
-
-
-def _recalled(trained: Policy) -> int:
-    """Returns the size of the gated recurrent unit; 0 without one."""
-    return 0 if trained.memory is None else trained.memory[2].shape[1]
-
-
 def _widest(trained: Policy) -> int:
     """Returns the largest input size of a layer."""
     *inputs, last, _ = _sizes(trained)
-    return max([trained.mean.shape[1], *inputs, last + _recalled(trained)])
+    return max([trained.mean.shape[1], *inputs, last + trained.carried])
 
 
 def _hearing(trained: Policy) -> dict[str, str]:
@@ -213,14 +184,10 @@ def _memory(trained: Policy) -> dict[str, str]:
             "kept": "It keeps nothing in RAM between calls.",
             "memory_start": "",
         }
-    what, code = "The memory of a robot.", _MEMORY_CODE
-    if trained.history > 1:
-        what = f"The {trained.history - 1} observations before the last one, newest first."
-        code = _HISTORY_CODE
     return {
-        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)).replace("WHAT", what),
+        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)),
         "memory_parameter": "PolicyMemory *memory, ",
-        "memory_code": code.replace("FEATURES", str(_sizes(trained)[-2])) + _BEGIN_CODE,
+        "memory_code": _MEMORY_CODE.replace("FEATURES", str(_sizes(trained)[-2])) + _BEGIN_CODE,
         "memory_begin": "    PolicyMemory memory[POLICY_LEARNERS];\n",
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
@@ -247,17 +214,15 @@ def _layout(trained: Policy) -> dict[str, str]:
 def _code(trained: Policy) -> dict[str, str]:
     """Returns the parts of the code that differ between policies."""
     robot, layout = trained.meta["robot"], trained.meta["observation"]
-    sizes, limit = _sizes(trained), number(layout["limit"])
     return {
         "widest": str(_widest(trained)),
         "offset": _values(layout["offset"]),
         "scale": _values(layout["scale"]),
-        "limit": limit,
+        "limit": number(layout["limit"]),
         "arrays": "\n".join(_arrays(trained)),
         "tanh": ", and nothing if the activation is relu" if trained.memory is None else "",
         "activation": _ACTIVATIONS[trained.meta["activation"]],
-        "history": _HISTORY_CALL.replace("LIMIT", limit) if trained.history > 1 else "",
-        "layers": "\n".join(_calls(sizes, _recalled(trained))),
+        "layers": "\n".join(_calls(_sizes(trained), trained.carried)),
         "max_speed": number(trained.max_speed),
         "max_turn_rate": number(trained.max_turn_rate),
         **{key: number(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
@@ -312,11 +277,10 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
 def _cases(trained: Policy) -> dict[str, str]:
     """Makes the self-test's cases, half of them beyond the clip, and NumPy's results for them."""
     draw = np.random.default_rng(0)
-    mean, std = (part[:, : _seen(trained)] for part in (trained.mean, trained.std))
-    shape = (CASES, *mean.shape)
+    shape = (CASES, *trained.mean.shape)
     reach = np.where(np.arange(CASES) % 2, 1.5 * trained.meta["observation"]["limit"], 3.0)
     drawn = draw.uniform(-1, 1, shape) * reach[:, None, None]
-    observation = (mean + std * drawn).astype(np.float32)
+    observation = (trained.mean + trained.std * drawn).astype(np.float32)
     action = _play(trained, observation)
     normal = draw.standard_normal(action.shape, np.float32)
     sample = action + np.exp(trained.log_std) * normal

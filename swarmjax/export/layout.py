@@ -68,11 +68,8 @@ def holds(policy: Policy) -> bool:
 
     Args:
       policy: the policy.
-
-    Returns:
-      False for files without this setting, since they are older than that rule.
     """
-    return policy.meta["task"].get("arrival", "latch") == "hold"
+    return policy.meta["task"]["arrival"] == "hold"
 
 
 def short(value: float) -> str:

@@ -58,8 +58,8 @@ def render(policy: Policy) -> bytes:
       [B, R, O], where R is the number of learners; `meta["observation"]` of the policy describes
       the entries. Its outputs are `action` ([..., U], as `policy.act` without `normal`) and
       `command` (as `policy.command`: m/s and rad/s). A policy with memory has a second input
-      `memory` and a third output `memory_after`: [..., H], or [..., (k - 1) O] for a history.
-      `memory` is zero at the start of an episode.
+      `memory` and a third output `memory_after`: [..., H]. `memory` is zero at the start of an
+      episode.
 
     Raises:
       ConfigError: if the package `onnx` is not installed.
@@ -82,7 +82,7 @@ def render(policy: Policy) -> bytes:
         graph.nodes,
         "policy",
         [
-            port("observation", policy.mean.shape[1] // policy.history),
+            port("observation", policy.mean.shape[1]),
             *(port("memory", n) for n in recalled),
         ],
         [
@@ -110,8 +110,6 @@ def _graph(policy: Policy) -> _Graph:
         """Adds a constant that broadcasts over the rows of a batch; robots come first."""
         return graph.constant(array[0] if shared else array[:, None])
 
-    if policy.history > 1:
-        _stack(graph, policy.carried)
     if not shared:
         graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each gets its own matrix
     graph.then("Sub", rows(policy.mean))
@@ -138,14 +136,6 @@ def _command(graph: _Graph, policy: Policy) -> None:
     low, high = (np.array(policy.meta["action"][key]) for key in ("low", "high"))
     graph.then("Mul", graph.constant((high - low) / 2))
     graph.then("Add", graph.constant((high + low) / 2), name="command")
-
-
-def _stack(graph: _Graph, size: int) -> None:
-    """Appends the earlier observations to the newest one, and outputs all but the oldest."""
-    stacked = graph.then("Concat", "memory", axis=-1)
-    bounds = (graph.constant([bound], np.int64) for bound in (0, size, -1))  # start, end, axis
-    graph.then("Slice", *bounds, name="memory_after")
-    graph.value = stacked
 
 
 def _hear(graph: _Graph, policy: Policy) -> None:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
-from swarmjax.policy import FORMAT, HEARING_FORMAT, MEMORY_FORMAT, PolicyError
+from swarmjax.config.section import LAST_READER
+from swarmjax.policy import FORMAT, PolicyError
 from swarmjax.policy_file.reach import Inputs, check_reach
 
 ACTION_NAMES = ("speed", "turn_rate")
@@ -19,15 +20,14 @@ RESPONSES = ("ideal", "webots", "real")
 ARRIVALS = ("latch", "hold")
 
 _MOST_MEMORY = 1024  # limit of the numbers in a robot's memory
-_MOST_HISTORY = 64  # limit of the observations that a policy uses
 _MOST_HEARD = 32  # limit of the neighbours, and of the numbers in each message
-NETWORK_FORMAT = 3  # for a policy whose network is an extension's code, which is not in the file
 NETWORK = "network/"  # how the names of an extension's arrays begin
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
 _SMALLEST = float(np.finfo(np.float32).tiny)
 _MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
 _MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
+_OWN_ARRAY = re.compile(NETWORK + r"(\w{1,64}/){0,8}\w{1,64}", re.ASCII)
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
 _META = {  # keys of `meta`, with their JSON types
@@ -39,12 +39,15 @@ _META = {  # keys of `meta`, with their JSON types
     "robot": dict,
     "sensors": dict,
     "task": dict,
+    "realism": dict,
+    "stages": list,
+    "extensions": dict,
     "config": dict,
     "versions": dict,
     "update": int,
     "seed": int,
 }
-_KINDS = {str: "text", int: "a whole number", dict: "an object"}
+_KINDS = {str: "text", int: "a whole number", dict: "an object", list: "a list"}
 
 
 def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
@@ -58,11 +61,10 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
       PolicyError: One sentence that names the field.
     """
     own = "network" in meta
-    if meta.get("format") != file_format(meta):
+    if meta.get("format") != FORMAT:
         raise PolicyError(
-            f"meta.format is {short_json(meta.get('format'))}, but this version reads {FORMAT}, "
-            f"{NETWORK_FORMAT} with meta.network, {MEMORY_FORMAT} with meta.memory or a history, "
-            f"and {HEARING_FORMAT} with neighbours: export the policy from its run again."
+            f"meta.format is {short_json(meta.get('format'))}, but this version reads {FORMAT} "
+            f"only: {LAST_READER} is the last commit that reads formats 2 to 4."
         )
     if own and not _is_name(meta["network"]):
         raise PolicyError(f"meta.network is {short_json(meta['network'])}: expected a name.")
@@ -77,9 +79,9 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if learners < 1 or (meta["policy"] == "shared" and learners != 1):
         expected = "1 for a shared policy" if meta["policy"] == "shared" else "1 or more"
         raise PolicyError(f"meta.learners is {short_json(learners)}: expected {expected}.")
-    _check_optional(meta)
+    _check_pieces(meta)
     recalled, heard = _check_memory(meta), _check_neighbours(meta)
-    size = _check_observation(meta["observation"]) * _check_history(meta)
+    size = _check_observation(meta["observation"])
     if heard.size > size:
         raise PolicyError(
             f"meta.observation.neighbours takes {heard.size} entries, but meta.observation.names "
@@ -90,47 +92,6 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     _check_arrays(arrays, _Sizes(learners, size, recalled, heard, actions), own=own)
     limit, bounded = float(meta["observation"]["limit"]), meta["activation"] == "tanh"
     check_reach(arrays, hidden_layers(arrays, own=own), Inputs(limit, heard.robots, bounded))
-
-
-def file_format(meta: Mapping[str, Any]) -> int:
-    """Returns the number of the format that a file with this `meta` has.
-
-    Args:
-      meta: The file's `meta`.
-
-    Returns:
-      2 to 5; docs/policy-format.md says what each adds.
-    """
-    layout = meta.get("observation")
-    if isinstance(layout, Mapping) and "neighbours" in layout:
-        return HEARING_FORMAT
-    if "memory" in meta or _has_history(meta):
-        return MEMORY_FORMAT
-    return NETWORK_FORMAT if "network" in meta else FORMAT
-
-
-def _has_history(meta: Mapping[str, Any]) -> bool:
-    """Tells whether a file's policy uses more than the last observation."""
-    layout = meta.get("observation")
-    history = layout.get("history", 1) if isinstance(layout, Mapping) else 1
-    return isinstance(history, int) and history > 1
-
-
-def _check_history(meta: Mapping[str, Any]) -> int:
-    """Checks and returns how many observations the policy uses; 1 if the file does not say."""
-    if "history" not in meta["observation"]:
-        return 1
-    _entry(meta["observation"], "history", int, "meta.observation")
-    history = meta["observation"]["history"]
-    if not 1 <= history <= _MOST_HISTORY:
-        raise PolicyError(
-            f"meta.observation.history is {short_json(history)}: expected 1 to {_MOST_HISTORY}."
-        )
-    if history > 1 and "memory" in meta:
-        raise PolicyError(
-            f"meta.observation.history is {history} beside meta.memory: expected one of them."
-        )
-    return history
 
 
 def _check_memory(meta: Mapping[str, Any]) -> int:
@@ -195,8 +156,6 @@ def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
                 f"{where}.{key} is {short_json(held[key])}: expected {least} to {_MOST_HEARD}."
             )
     _check_positive(held, "range", where)
-    if meta["observation"].get("history", 1) != 1:
-        raise PolicyError(f"{where} is given beside a history: expected one of them.")
     return _Heard(held["count"], held["message_size"])
 
 
@@ -211,19 +170,17 @@ def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta"
         raise PolicyError(f"{where}.{key} is {short_json(value)}: expected {_KINDS[kind]}.")
 
 
-def _check_optional(meta: Mapping[str, Any]) -> None:
-    """Checks the keys that older files lack."""
-    for key in ("realism", "extensions"):
-        if key in meta:
-            _entry(meta, key, dict)
-    for name, pieces in meta.get("extensions", {}).items():
+def _check_pieces(meta: Mapping[str, Any]) -> None:
+    """Checks the stages and the digests of extensions."""
+    for name, pieces in meta["extensions"].items():
         if not _are_texts(pieces):
             raise PolicyError(
                 f"meta.extensions.{short_json(name)} is {short_json(pieces)}: expected digests."
             )
-    stages = meta.get("stages", [])
-    if not isinstance(stages, list | tuple) or not all(isinstance(x, dict) for x in stages):
-        raise PolicyError(f"meta.stages is {short_json(stages)}: expected a list of objects.")
+    if not all(isinstance(stage, dict) for stage in meta["stages"]):
+        raise PolicyError(
+            f"meta.stages is {short_json(meta['stages'])}: expected a list of objects."
+        )
 
 
 def _are_texts(pieces: object) -> bool:
@@ -332,8 +289,7 @@ def _check_embodiment(meta: Mapping[str, Any]) -> None:
     _check_positive(sensors, "range", "meta.sensors")
     for key in ("control_step", "target_radius"):
         _check_positive(task, key, "meta.task")
-    if "arrival" in task:  # older files lack this key, and their rule is `latch`
-        _choice(task, "arrival", ARRIVALS, "meta.task")
+    _choice(task, "arrival", ARRIVALS, "meta.task")
 
 
 def _check_preset(mapping: Mapping[str, Any], where: str) -> None:
@@ -373,7 +329,9 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool)
             raise PolicyError(f"{name} is missing: the policy has {depth} hidden layers.")
     for name, array in arrays.items():
         if name not in shapes:
-            raise PolicyError(f"{name} is not known: format {FORMAT} has no such array.")
+            raise PolicyError(
+                f"{short_json(name)} is not known: format {FORMAT} has no such array."
+            )
         _check_array(name, array, shapes[name])
     if (arrays["actor/log_std"] > _MOST_LOG_STD).any():
         raise PolicyError(
@@ -400,8 +358,8 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 def _network_shapes(arrays: Mapping[str, np.ndarray], learners: int) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of an extension's network arrays; each has an axis of learners."""
-    found = {name: array for name, array in arrays.items() if name.startswith(NETWORK)}
-    return {name: (learners, *array.shape[1:]) for name, array in found.items()}
+    own = {name: array for name, array in arrays.items() if _OWN_ARRAY.fullmatch(name)}
+    return {name: (learners, *array.shape[1:]) for name, array in own.items()}
 
 
 def hidden_layers(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:

@@ -1,8 +1,8 @@
 """The settings of PPO."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
@@ -35,23 +35,6 @@ class AlgoConfig(Section):
     Such an option is null with the other choices. With the choice that the option belongs to, null
     means the option's default.
     """
-
-    removed: ClassVar[Mapping[str, str]] = {
-        "memory_span": "a new memory keeps a number for two control steps.",
-        **dict.fromkeys(
-            ("contact_limit", "contact_price_rate", "contact_price_arrivals"),
-            "give a negative task.reward.robot_contact instead.",
-        ),
-    }
-    renamed: ClassVar[Mapping[str, str]] = {
-        "rollout": "rollout_length",
-        "minibatches": "num_minibatches",
-        "hidden": "hidden_sizes",
-        "clip": "clip_epsilon",
-        "returns": "advantage",
-        "output": "mean_activation",
-        "gradient": "update_backend",
-    }
 
     name: Literal["ppo", "paper"] = field(
         default="ppo", metadata=about("preset that gave the first values", derived=True)

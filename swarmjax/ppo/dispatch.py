@@ -46,12 +46,11 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
       ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
     """
     if config.memory != "none":  # the other faster ways handle single samples
-        left = config.update_backend == "auto"
-        return "sequences" if left and _has_fast() else "autodiff"
+        return "sequences" if config.update_backend == "auto" else "autodiff"
     if _fuses(config, observation_size, action_size):
         return "fused"
     whole = config.num_minibatches == 1 and jax.default_backend() == "cpu"
-    return "blocks" if whole and _has_fast() else "autodiff"
+    return "blocks" if whole else "autodiff"
 
 
 def bind_memory(config: AlgoConfig) -> AlgoConfig:
@@ -63,7 +62,7 @@ def bind_memory(config: AlgoConfig) -> AlgoConfig:
     Returns:
       The config with the kernels; unchanged without memory, or where `resolve` avoids kernels.
     """
-    asked = config.memory != "none" and config.update_backend == "auto" and _has_fast()
+    asked = config.memory != "none" and config.update_backend == "auto"
     if not asked or not _has_tensor_cores() or _is_full_precision():
         return config
     from swarmjax.ppo.fast import kernel, recurrence
@@ -89,28 +88,12 @@ def find(backend: Backend) -> Learn | None:
     return None
 
 
-def _has_fast() -> bool:
-    """Tells whether the faster ways can be imported."""
-    try:
-        import swarmjax.ppo.fast  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
 def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
     """Tells whether to use the kernels; refuses `fused` where they are not available."""
     if config.update_backend == "autodiff" or config.critic == "state":
         return False
     if config.hearing is not None:  # the kernels support no layer in front of the hidden ones
         return False
-    if not _has_fast():
-        if config.update_backend == "auto":
-            return False
-        raise ConfigError(
-            "algo.update_backend is fused, but swarmjax.ppo.fast cannot be imported: give auto or "
-            "autodiff."
-        )
     possible = _has_tensor_cores()
     fitting = possible and _fits(config, observation_size, action_size)
     if config.update_backend == "fused" and not possible:

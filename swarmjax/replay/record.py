@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from swarmjax import extension
-from swarmjax.config import build, show
-from swarmjax.config.section import modernise
+from swarmjax.config import show
+from swarmjax.config.section import build_stored
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.extension import RewardTerm
@@ -163,8 +163,7 @@ def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
         raise PolicyError(f"meta.config.task is {show(stored)}: expected an object.")
     if "reward" not in stored:
         return task.reward
-    kept = modernise(RewardConfig, stored["reward"])
-    return build(RewardConfig, kept, "the policy's config.task.reward.")
+    return build_stored(RewardConfig, stored["reward"], "the policy's config.task.reward.")
 
 
 def record(

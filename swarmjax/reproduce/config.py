@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, build, files, show, to_dict
-from swarmjax.config.section import MAX_COUNT, modernise
+from swarmjax.config.section import MAX_COUNT, build_stored
 
 _REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
 
@@ -36,7 +36,6 @@ class ReproduceConfig(Section):
     """
 
     command: ClassVar[str] = "reproduce"
-    renamed: ClassVar[Mapping[str, str]] = {"rollout": "rollout_length"}
 
     seeds: int = field(default=10, metadata=about("seeds of each arm; at least 3", 1, 4096))
     seed: int = field(default=0, metadata=about("the first seed", 0, MAX_COUNT))
@@ -137,7 +136,5 @@ def load_reproduce(
                 f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of "
                 f"the stored reproduction and takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
             )
-    kept = to_dict(build(ReproduceConfig, modernise(ReproduceConfig, stored), "stored ")) | {
-        "minutes": None
-    }
+    kept = to_dict(build_stored(ReproduceConfig, stored, "stored ")) | {"minutes": None}
     return build(ReproduceConfig, kept | files.nest(words))

@@ -15,8 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from swarmjax.evaluate import statistics
-from swarmjax.evaluate.curves import curve
-from swarmjax.evaluate.statistics import iqm
+from swarmjax.evaluate.statistics import curve, iqm
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure

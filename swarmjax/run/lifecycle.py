@@ -38,7 +38,6 @@ _GIVE_UP = (
     "The run had already gone back once: give lower algo.actor_learning_rate and "
     "algo.critic_learning_rate, or look at metrics.jsonl for what broke."
 )
-_PRICE = "learners/price/"  # in checkpoints from the time when algo.contact_limit was a key
 
 
 def carry_out(settings: TrainConfig, run: Path, stop: Stop, display: Display) -> Tally:
@@ -275,14 +274,11 @@ def _first_state(
         if source is None:
             return state, []
         return warm_start.carry(source, state, settings), source.skipped
-    skipped = kept.skipped
-    if any(name.startswith(_PRICE) for name in kept.leaves):
-        skipped = [*skipped, f"a price on contacts (algo.contact_limit) in {settings.resume}"]
     if kept.has_arenas:
-        return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), skipped
+        return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), kept.skipped
     without: Any = replace(template, arenas=None)
     state = mesh.put(program, checkpoint.from_leaves(kept.leaves, without))
-    return mesh.draw_arenas(program, schedule, state), skipped
+    return mesh.draw_arenas(program, schedule, state), kept.skipped
 
 
 def find_run(settings: TrainConfig) -> Path:

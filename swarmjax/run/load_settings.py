@@ -7,7 +7,7 @@ from typing import Any
 
 from swarmjax import extension
 from swarmjax.config import ConfigError, build, files, inherit, reading, section, show, to_dict
-from swarmjax.config.section import modernise
+from swarmjax.config.section import build_stored
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
@@ -33,20 +33,19 @@ _SHARED = (
 
 
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
-    """Makes the configuration that a run directory or a policy holds, written by any version.
+    """Makes the configuration that a run directory or a policy holds.
 
     A file of extensions that it names is left out: only a command line or Python names code.
 
     Args:
-      stored: the result of `to_dict`. Old names of keys are translated, and removed keys are left
-        out.
+      stored: the result of `to_dict`.
       where: the prefix of its keys in messages.
 
     Raises:
       ConfigError: if it is invalid.
     """
-    known = modernise(TrainConfig, stored)
-    return build(TrainConfig, {key: known[key] for key in known if key != "extensions"}, where)
+    own = {key: value for key, value in stored.items() if key != "extensions"}
+    return build_stored(TrainConfig, own, where)
 
 
 def read_config(run: Path) -> dict:

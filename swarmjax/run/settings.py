@@ -1,6 +1,5 @@
 """The settings of a training run, and checks that involve several sections."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -117,7 +116,6 @@ class TrainConfig(ProgramConfig):
     """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
-    renamed: ClassVar[Mapping[str, str]] = {"start": "init_from", "start_std": "init_from_std"}
     # What is trained. Which code runs, where it is written, what it starts from and who is called
     # is decided by whoever starts the run.
     shared: ClassVar[tuple[str, ...]] = (

@@ -11,7 +11,7 @@ class Command(NamedTuple):
 
     Attributes:
       settings: module and name of the dataclass of its keys. Importing it must not need JAX.
-      meaning: its purpose, in one sentence without quotes, because shell scripts quote it.
+      meaning: its purpose, in one sentence.
     """
 
     settings: str

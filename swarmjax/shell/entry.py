@@ -9,7 +9,6 @@ import swarmjax
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, show
 from swarmjax.exit_codes import USER_ERROR
-from swarmjax.shell import completion
 from swarmjax.shell.commands import COMMANDS, settings
 
 _TOLD = ("jax", "mujoco", "mujoco-mjx", "python")  # `--version` lists these after swarmjax
@@ -26,19 +25,17 @@ def main() -> int:
         return _command(name, rest)
     with command.outputs_kept("swarmjax") as ended:
         try:
-            return ended(_run(name, rest))
+            return ended(_run(name))
         except ConfigError as error:
             sys.stderr.write(f"swarmjax: error: {error}\n")
             return USER_ERROR
 
 
-def _run(name: str, rest: Sequence[str]) -> int:
+def _run(name: str) -> int:
     if name in command.HELP:
         sys.stdout.write(help_text() + "\n")
     elif name == "--version":
         sys.stdout.write(_versions() + "\n")
-    elif name == "--completion":
-        sys.stdout.write(completion.script(rest[0] if rest else ""))
     else:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
@@ -62,7 +59,6 @@ def help_text() -> str:
     lines += [
         "",
         "swarmjax COMMAND --help gives examples and keys; so does python -m swarmjax.COMMAND.",
-        f"swarmjax --completion {'|'.join(completion.SHELLS)} prints a script of completions.",
         "swarmjax --version names the versions of swarmjax, JAX and MuJoCo.",
     ]
     return "\n".join(lines)

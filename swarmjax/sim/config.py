@@ -154,7 +154,6 @@ class SimConfig(Section):
         metadata=about(
             "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
             "body, on wheels only with impl=warp; auto: swarm where available",
-            renamed={"newton": "mjx"},
         ),
     )
     max_robots: int | None = field(

@@ -1,7 +1,6 @@
 """Chooses the faster code of `sim/fast/` where it exists, and plain code elsewhere.
 
-The rest of this package uses plain MJX and plain loops. That code works without `fast/`, but more
-slowly.
+The rest of this package uses plain MJX and plain loops.
 """
 
 import importlib
@@ -10,6 +9,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from swarmjax.config import ConfigError
 
@@ -38,6 +39,7 @@ _MOST_RUBBING_SWEEPS = 400
 # In a jam of more wheeled robots, the solver made for wheels leaves an error of up to 7 mm/s
 # (design note 38).
 MOST_WHEELED = 5
+MOST_PIECES = 16  # objects processed one by one; the program grows with their number
 
 
 def resolve_impl(impl: str) -> str:
@@ -98,14 +100,10 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
             "sim.solver is swarm, but robot.body is wheeled and its hulls have friction "
             "(robot.hull_friction or realism.hull_friction): give mjx or auto, or leave both out."
         )
-    if solver == "swarm" and _discs() is None:
-        raise ConfigError(
-            "sim.solver is swarm, but swarmjax.sim.fast cannot be imported: give mjx or auto."
-        )
     if solver != "auto":
         return solver
     possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED and not rubs)
-    return "swarm" if possible and _discs() is not None else "mjx"
+    return "swarm" if possible else "mjx"
 
 
 class EngineChoice(NamedTuple):
@@ -199,26 +197,26 @@ def load_paths(impl: str) -> ModuleType | None:
     Returns:
       `swarmjax.sim.fast.paths_warp`, or None.
     """
-    if impl != "warp" or _discs() is None:
-        return None
-    return importlib.import_module("swarmjax.sim.fast.paths_warp")
+    return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.paths_warp")
 
 
 def pieces(count: int, xp: Any) -> list[slice]:
-    """Splits an axis of objects into slices of the size that is processed fastest.
+    """Splits an axis of objects into slices, so that XLA makes one kernel of the computation.
+
+    On a GPU, a minimum over four obstacles becomes its own kernel, which reads its inputs from
+    memory. One by one, all operations are elementwise, and XLA keeps the values in registers.
 
     Args:
       count: number of objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Slices that cover the axis; without `fast/unroll.py`, a single slice.
+      Slices that cover the axis, one per object. A single slice for many objects, for none, and for
+      NumPy, where every call costs time.
     """
-    try:
-        from swarmjax.sim.fast import unroll
-    except ImportError:
+    if xp is np or not 0 < count <= MOST_PIECES:
         return [slice(None)]
-    return unroll.pieces(count, xp)
+    return [slice(i, i + 1) for i in range(count)]
 
 
 def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
@@ -236,12 +234,3 @@ def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
     for value in values:
         found = xp.minimum(found, xp.min(value, axis=-1, initial=limit))
     return found
-
-
-def _discs() -> ModuleType | None:
-    """Returns the engine module of planar robots; None without `fast/`."""
-    try:
-        from swarmjax.sim.fast import discs
-    except ImportError:
-        return None
-    return discs

@@ -1,8 +1,7 @@
 """Settings of the task and its reward."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, files, show
@@ -23,8 +22,6 @@ def _weight(meaning: str) -> dict[str, Any]:
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
     """Weights of the reward terms: equation 3 of the paper, and penalties."""
-
-    renamed: ClassVar[Mapping[str, str]] = {"time": "step_penalty"}
 
     progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
     path_progress: float = field(

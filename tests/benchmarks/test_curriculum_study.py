@@ -13,12 +13,11 @@ import pytest
 from matplotlib.figure import Figure
 from sentences import refusal
 
-from benchmarks import curriculum, curriculum_arms, curriculum_table
+from benchmarks import curriculum, curriculum_arms, curriculum_table, learners_judge
 from benchmarks.curriculum_arms import StudyConfig
 from benchmarks.curriculum_table import Key
 from swarmjax import command
 from swarmjax.curriculum.config import CurriculumConfig
-from swarmjax.evaluate import engine_mjx
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.learner import LearnerState
 from swarmjax.run.load_settings import load_train
@@ -185,10 +184,10 @@ def test_the_judge_gives_means_by_seed_and_stage(trained: TrainConfig) -> None:
         replace(trained, arenas=4, algo=replace(trained.algo, num_minibatches=1))
     )
     alone = jax.jit(
-        partial(engine_mjx.outcomes, world, trained.algo, steps=trained.task.step_limit)
+        partial(learners_judge.outcomes, world, trained.algo, steps=trained.task.step_limit)
     )
     for role, stage in judged.items():
-        levels = engine_mjx.draw_levels(world, stage, 5, 4)
+        levels = learners_judge.draw_levels(world, stage, 5, 4)
         for seed in range(2):
             outcome = alone(jax.tree.map(lambda x, i=seed: x[i], learners), levels)
             for name, values in outcome._asdict().items():

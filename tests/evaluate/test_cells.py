@@ -146,7 +146,7 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
         (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
         (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
-        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' does not"),
+        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' is not"),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(

@@ -96,9 +96,8 @@ def _pose(arenas: Arenas) -> np.ndarray:
     return np.stack([data.qpos.reshape(-1, 3) for data in arenas.data])
 
 
-@pytest.mark.parametrize("kind", ["gru", "history"])
-def test_a_step_needs_the_action_of_a_policy_that_remembers(kind: str, tmp_path: Path) -> None:
-    given, said = policies.recalling(kind, policies.arrays(), 3)
+def test_a_step_needs_the_action_of_a_policy_that_remembers(tmp_path: Path) -> None:
+    given, said = policies.recalling(policies.arrays(), 3)
     trained = policies.saved(tmp_path / "recalls.npz", given, **said)
     judge = dataclasses.replace(_judge(tmp_path, _stage()), policy=trained)
     arenas = _start(judge, [[-0.1, 0.2, 0.0]])

@@ -39,7 +39,7 @@ def _policy(path: Path, words: list[str] = WORDS, kind: str = "none") -> str:
     if heard.count:
         arrays, _ = policies.hearing(arrays, heard.count, heard.message_size)
     if kind == "gru":
-        arrays, meta = policies.recalling("gru", arrays, 5, **meta)
+        arrays, meta = policies.recalling(arrays, 5, **meta)
     policies.saved(path, arrays, **meta)
     return str(path)
 

@@ -102,7 +102,7 @@ def test_all_forms_of_a_policy_agree(activation: Activation, learners: int, tmp_
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
 
 
-STEPS, MEMORY, HISTORY = 1_000, 16, 5
+STEPS, MEMORY = 1_000, 16
 
 
 def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
@@ -129,19 +129,6 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
     return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
-
-
-def _by_flax_stacked(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Returns actions [T, R, U] of the Flax networks for observations stacked by hand.
-
-    Observations before the start of an episode are zeros.
-    """
-    since = np.arange(len(seen)) - np.maximum.accumulate(np.where(begins, np.arange(len(seen)), 0))
-    looks = [
-        np.where((since >= age)[:, None, None], np.roll(seen, age, axis=0), 0.0)
-        for age in range(HISTORY)
-    ]
-    return _by_flax(arrays, "tanh", np.concatenate(looks, axis=-1).astype(np.float32))
 
 
 def _by_numpy_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.ndarray:
@@ -186,20 +173,17 @@ def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: P
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
 @pytest.mark.parametrize("learners", [1, 3])
-@pytest.mark.parametrize("kind", ["gru", "history"])
 def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
-    kind: str, learners: int, tmp_path: Path
+    learners: int, tmp_path: Path
 ) -> None:
     plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
-    size = MEMORY if kind == "gru" else HISTORY
-    arrays, said = policies.recalling(kind, plain, size, **several(learners))
-    by_flax = _by_flax_steps if kind == "gru" else _by_flax_stacked
+    arrays, said = policies.recalling(plain, MEMORY, **several(learners))
     trained = saved(tmp_path / "policy.npz", arrays, **said)
     seen = policies.seen(trained, STEPS)
     begins = np.arange(STEPS) % 300 == 0
     expected = _by_numpy_steps(trained, seen, begins)
     found = {
-        "Flax": by_flax(arrays, seen, begins),
+        "Flax": _by_flax_steps(arrays, seen, begins),
         "ONNX": _by_onnx_steps(trained, seen, begins),
         "C": _by_c_steps(trained, seen, begins, tmp_path / "c"),
     }
@@ -250,7 +234,7 @@ def test_all_forms_of_a_policy_that_hears_agree(kind: str, learners: int, tmp_pa
     plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
     arrays, said = policies.hearing(plain, HEARD, SAID, **several(learners))
     if kind == "gru":
-        arrays, said = policies.recalling("gru", arrays, MEMORY, **said)
+        arrays, said = policies.recalling(arrays, MEMORY, **said)
     trained = saved(tmp_path / "policy.npz", arrays, **said)
     seen = policies.seen(trained, STEPS)
     begins = np.arange(STEPS) % 300 == 0

@@ -57,18 +57,12 @@ def test_it_builds_without_warnings_and_its_self_test_passes(
 
 @needs_gcc
 @pytest.mark.parametrize("learners", [1, 3])
-@pytest.mark.parametrize(
-    ("kind", "changed"),
-    [
-        ("gru", ("(recalled[i] - fresh)", "(recalled[i])")),
-        ("history", ("recalled[i - POLICY_OBSERVATIONS]", "recalled[i]")),
-    ],
-)
 def test_one_that_remembers_builds_without_warnings_and_its_self_test_passes(
-    kind: str, changed: tuple[str, str], learners: int, tmp_path: Path
+    learners: int, tmp_path: Path
 ) -> None:
+    changed = ("(recalled[i] - fresh)", "(recalled[i])")
     plain = policies.arrays(hidden=(16, 7), learners=learners)
-    given, said = policies.recalling(kind, plain, 5, **several(learners))
+    given, said = policies.recalling(plain, 5, **several(learners))
     folder = _written(tmp_path / "c", saved(tmp_path / "p.npz", given, **said))
     built = _run(folder, "gcc", *STRICT, "policy.c", "policy_test.c", "-lm", "-o", "self_test")
     assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
@@ -80,9 +74,7 @@ def test_one_that_remembers_builds_without_warnings_and_its_self_test_passes(
     assert _run(folder, "./self_test").returncode != 0
 
 
-@pytest.mark.parametrize(
-    ("said", "holds"), [({}, 0), ({"arrival": "latch"}, 0), ({"arrival": "hold"}, 1)]
-)
+@pytest.mark.parametrize(("said", "holds"), [({"arrival": "latch"}, 0), ({"arrival": "hold"}, 1)])
 def test_the_header_says_whether_the_robot_is_to_stop(
     said: dict, holds: int, tmp_path: Path
 ) -> None:

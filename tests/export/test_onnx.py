@@ -43,13 +43,8 @@ def test_the_model_is_sound_and_runs_any_batch(learners: int, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("learners", [1, 3])
-@pytest.mark.parametrize(("kind", "carried"), [("gru", 4), ("history", 3 * SIZE)])
-def test_the_model_of_one_that_remembers_is_sound(
-    kind: str, carried: int, learners: int, tmp_path: Path
-) -> None:
-    given, said = policies.recalling(
-        kind, policies.arrays(learners=learners), 4, **several(learners)
-    )
+def test_the_model_of_one_that_remembers_is_sound(learners: int, tmp_path: Path) -> None:
+    given, said = policies.recalling(policies.arrays(learners=learners), 4, **several(learners))
     content = export_onnx.render(saved(tmp_path / "policy.npz", given, **said))
     onnx.checker.check_model(onnx.load_from_string(content), full_check=True)
     session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
@@ -57,10 +52,10 @@ def test_the_model_of_one_that_remembers_is_sound(
     found = {port.name: port.shape for port in (*session.get_inputs(), *session.get_outputs())}
     assert found == {
         "observation": [*rows, SIZE],
-        "memory": [*rows, carried],
+        "memory": [*rows, 4],
         "action": [*rows, 2],
         "command": [*rows, 2],
-        "memory_after": [*rows, carried],
+        "memory_after": [*rows, 4],
     }
 
 

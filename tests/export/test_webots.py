@@ -266,12 +266,11 @@ def test_a_robot_that_holds_drives_on_at_its_target(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("learners", [1, 3])
-@pytest.mark.parametrize("kind", ["gru", "history"])
 def test_a_robot_remembers_until_it_has_another_target_or_number(
-    kind: str, learners: int, tmp_path: Path
+    learners: int, tmp_path: Path
 ) -> None:
     given = policies.arrays(hidden=(16, 16), learners=learners, names=NAMES)
-    given, said = policies.recalling(kind, given, 4, **several(learners), observation=METRIC)
+    given, said = policies.recalling(given, 4, **several(learners), observation=METRIC)
     path = tmp_path / "policy.npz"
     saved(path, given, **said)
     assert export.main([f"policy={path}", "format=webots"]) == 0

@@ -34,6 +34,15 @@ def test_a_run_from_before_the_choice_of_gradient_goes_on():
     assert load_resume(stored, []).algo.update_backend == "auto"
 
 
+def test_a_run_of_an_older_version_names_the_last_commit_that_reads_it():
+    stored = to_dict(load_train([]))
+    stored["task"]["reward"]["time"] = -0.01
+    assert refusal(load_resume, stored, []) == (
+        "stored task.reward.time is not a key: if an older version wrote it, d8b3078 is the last "
+        "commit that reads it."
+    )
+
+
 def test_a_long_word_is_shortened_where_resume_refuses_it():
     assert len(refusal(load_resume, to_dict(load_train([])), ["seed=" + "9" * 4000])) < 300
 

@@ -125,7 +125,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["a\nb"], "'a\\nb' is not a setting: give key=value."),
         (["hydra/launcher=x"], "'hydra/launcher=x' is not a setting: give key=value."),
         (["arena=3"], "arena is not a key: did you mean arenas?"),
-        (["algo.clp=1"], "algo.clp is not a key: did you mean algo.clip_epsilon?"),
+        (["algo.clip_epsion=1"], "algo.clip_epsion is not a key: did you mean algo.clip_epsilon?"),
         (["task.reward.progres=1"], "task.reward.progres is not a key: did you mean "
          "task.reward.progress?"),
         (["robots=3"], "robots is not a key: did you mean stage.robots?"),

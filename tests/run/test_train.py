@@ -19,7 +19,7 @@ from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint, directory, lifecycle
-from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
+from swarmjax.run.checkpoint import CheckpointError, digest
 from swarmjax.run.directory import LOCK
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -208,25 +208,6 @@ def test_a_run_that_is_done_can_be_written_elsewhere(
     assert train.main([f"resume={whole}", f"run.dir={tmp_path}"]) == 0
     assert _digest(tmp_path) == _digest(whole)
     assert {"config.json", "policy.npz", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
-
-
-def test_a_run_with_a_price_of_contacts_goes_on_without_it(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Resumes a run of an old version with `algo.contact_limit`, which is no longer a key."""
-    stopped = tmp_path / "stopped"
-    assert _train(f"run.dir={stopped}", "run.stop_after=4") == 0
-    stored = json.loads((stopped / "config.json").read_text())
-    stored["algo"] |= {"contact_limit": 0.5, "contact_price_rate": 0.1}
-    (tmp_path / "config.json").write_text(json.dumps(stored))
-    leaves = checkpoint.restore(stopped)[0] | {"learners/price/height": np.full((1, 1), 0.25)}
-    with Checkpoints(tmp_path, keep=1) as checkpoints:
-        checkpoints.save(leaves, 4)
-    capsys.readouterr()
-    assert train.main([f"resume={tmp_path}"]) == 0
-    said = f"a price on contacts (algo.contact_limit) in {tmp_path}: it was passed over."
-    assert said in " ".join(capsys.readouterr().out.split())
-    assert _digest(tmp_path) == _digest(whole)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from swarmjax import command
 from swarmjax.shell import entry
 from swarmjax.shell.commands import COMMANDS, settings
 
-# Packages that help and completion must not import.
+# Packages that help must not import.
 _HEAVY = ("jax", "flax", "optax", "orbax", "matplotlib")
 
 
@@ -28,7 +28,6 @@ def test_help_lists_every_command_with_a_sentence(
     for name, each in COMMANDS.items():
         assert f"  {name:<10}  {each.meaning}" in lines
         assert each.meaning.endswith(".")
-        assert "'" not in each.meaning
 
 
 def test_without_a_command_there_is_help(
@@ -60,7 +59,6 @@ def test_version_names_swarmjax_jax_and_mujoco(
             ["frob"],
             f"'frob' is not a command: give one of {', '.join(COMMANDS)}.",
         ),
-        (["--completion"], "--completion is '': give one of bash, zsh, fish."),
     ],
 )
 def test_what_is_not_known_is_one_sentence_and_exit_code_2(
@@ -82,14 +80,13 @@ def test_help_of_a_command_is_that_of_its_module(
     assert capsys.readouterr().out == expected + "\n"
 
 
-def test_help_and_completion_import_no_jax() -> None:
+def test_help_imports_no_jax() -> None:
     code = (
         "import sys\n"
-        "from swarmjax.shell import completion, entry\n"
+        "from swarmjax.shell import entry\n"
         "for name in entry.COMMANDS:\n"
         "    sys.argv = ['swarmjax', name, '--help']\n"
         "    entry.main()\n"
-        "completion.script('bash')\n"
         f"sys.exit(','.join(set(sys.modules) & set({_HEAVY!r})))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -1,6 +1,5 @@
 """Tests the choice of implementation and solver, and minima over the pieces of an axis."""
 
-import sys
 from functools import partial
 from types import ModuleType
 
@@ -10,8 +9,7 @@ import pytest
 
 from swarmjax.config import ConfigError
 from swarmjax.sim import dispatch
-from swarmjax.sim.dispatch import least, pieces
-from swarmjax.sim.fast.unroll import MOST
+from swarmjax.sim.dispatch import MOST_PIECES, least, pieces
 
 MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 
@@ -51,21 +49,8 @@ def test_hulls_that_rub_are_solved_where_the_solver_knows_friction() -> None:
         resolve("swarm", "warp", "wheeled", 5)
 
 
-def test_without_the_faster_ways_mjx_steps_and_all_is_one_piece(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "swarmjax.sim.fast", None)  # cannot be imported
-    for impl, body in (("jax", "planar"), ("warp", "planar"), ("warp", "wheeled")):
-        assert dispatch.resolve_solver("auto", impl, body, 5) == "mjx"
-        with pytest.raises(
-            ConfigError, match=r"swarmjax\.sim\.fast cannot be imported: give mjx or auto\.$"
-        ):
-            dispatch.resolve_solver("swarm", impl, body, 5)
-    assert pieces(3, jnp) == [slice(None)]
-
-
 @MODULES
-@pytest.mark.parametrize("count", [3, MOST + 1])
+@pytest.mark.parametrize("count", [3, MOST_PIECES + 1])
 def test_least_of_all_pieces(xp: ModuleType, count: int) -> None:
     reach = np.stack([np.arange(count), 7.0 - np.arange(count), np.full(count, 9.0)])
     found = least([xp.asarray(reach)[:, i] for i in pieces(count, xp)], 6.5, xp)

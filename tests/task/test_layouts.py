@@ -7,10 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plans
 import pytest
 
 from swarmjax.config import build, to_dict
-from swarmjax.evaluate import plan
 from swarmjax.task import level, room, stage_files
 from swarmjax.task import stage as task_stage
 from swarmjax.task.layouts import LAYOUTS, maze
@@ -121,26 +121,26 @@ def _assert_same_bits(name: str, count: int) -> None:
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"crowd", "circle"}))
 def test_a_plan_shows_that_every_level_can_be_solved(name: str, *, far: bool) -> None:
     for drawn in _levels(name, far=far)[:5]:
-        moves = plan.find(drawn, HULL, REACH)
+        moves = plans.find(drawn, HULL, REACH)
         assert moves is not None
-        assert plan.check(drawn, moves, HULL, REACH) is None
+        assert plans.check(drawn, moves, HULL, REACH) is None
 
 
 @pytest.mark.slow
 def test_a_plan_exchanges_a_circle() -> None:
     (drawn,) = _levels("circle", 1)
-    moves = plan.find(drawn, HULL, REACH)
+    moves = plans.find(drawn, HULL, REACH)
     assert moves is not None
-    assert plan.check(drawn, moves, HULL, REACH) is None
+    assert plans.check(drawn, moves, HULL, REACH) is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"crowd", "circle"}))
 def test_a_thousand_levels_can_be_solved(name: str) -> None:
     for drawn in _levels(name, 1000):
-        moves = plan.find(drawn, HULL, REACH)
+        moves = plans.find(drawn, HULL, REACH)
         assert moves is not None
-        assert plan.check(drawn, moves, HULL, REACH) is None
+        assert plans.check(drawn, moves, HULL, REACH) is None
 
 
 @pytest.mark.slow

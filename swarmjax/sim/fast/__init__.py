@@ -3,6 +3,6 @@
 `discs.py` steps planar robots. Their contacts are solved by `planar_jax.py` or `planar_warp.py`,
 and contacts with friction by `rubbing_jax.py` or `rubbing_warp.py`. For wheeled robots,
 `warp_step.py` makes MJX-Warp use the solver of `wheeled_warp.py` (with `wheeled_problem.py` and
-`wheeled_pairs.py`). `paths_warp.py` finds shortest paths. `unroll.py` splits short axes for XLA.
+`wheeled_pairs.py`). `paths_warp.py` finds shortest paths.
 Tests compare each physics step with MuJoCo C.
 """

@@ -56,7 +56,7 @@ ${hearing_code}${memory_code}void policy_action(unsigned learner, const float ob
     for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
         a[i] = clip((observation[i] - MEAN[learner][i]) / STD[learner][i], $limit);
     }
-${history}${hearing_call}$layers
+${hearing_call}$layers
 }
 
 void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],

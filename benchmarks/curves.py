@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swarmjax.evaluate.statistics import Interval, Statistic, bootstrap, checked, checked_table, iqm
+from swarmjax.evaluate.statistics import checked
 
 
 def area_under(steps: ArrayLike, values: ArrayLike) -> np.ndarray:
@@ -67,44 +67,3 @@ def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray
         if np.isinf(numbers).any():
             raise ValueError(f"{name} holds inf: the points of a curve are finite.")
     return at, curves
-
-
-def curve(
-    values: ArrayLike,
-    statistic: Statistic = iqm,
-    *,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Interval[np.ndarray]:
-    """Computes the interval of a statistic over runs at each point of their curves.
-
-    All points use the same draws, so each drawn run contributes its whole curve. The confidence
-    holds for each point by itself, not for all points at once.
-
-    Args:
-      values: [runs, points] values in any unit, of at least three runs.
-      statistic: as in `bootstrap`, called on [..., runs, 1].
-      confidence: as in `bootstrap`.
-      resamples: as in `bootstrap`.
-      seed: seed of the draws.
-
-    Returns:
-      Estimates and intervals [points].
-
-    Raises:
-      ValueError: As in `bootstrap`.
-    """
-    columns = checked_table("values", values, "runs").T[..., None]
-    found = [
-        bootstrap(
-            column,
-            statistic,
-            draw="runs",
-            confidence=confidence,
-            resamples=resamples,
-            seed=seed,
-        )
-        for column in columns
-    ]
-    return Interval(*np.array(found).T)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmjax.sim import gaps, infrared
-from swarmjax.sim.fast.unroll import MOST, pieces
+from swarmjax.sim.dispatch import MOST_PIECES, pieces
 
 RADIUS = 0.037  # m
 RANGE = 0.04  # m
@@ -18,16 +18,16 @@ MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 
 def test_jax_takes_few_things_one_by_one() -> None:
     assert pieces(3, jnp) == [slice(0, 1), slice(1, 2), slice(2, 3)]
-    assert len(pieces(MOST, jnp)) == MOST
+    assert len(pieces(MOST_PIECES, jnp)) == MOST_PIECES
 
 
-@pytest.mark.parametrize(("count", "xp"), [(0, jnp), (MOST + 1, jnp), (0, np), (3, np)])
+@pytest.mark.parametrize(("count", "xp"), [(0, jnp), (MOST_PIECES + 1, jnp), (0, np), (3, np)])
 def test_many_things_none_and_numpy_are_one_piece(count: int, xp: ModuleType) -> None:
     assert pieces(count, xp) == [slice(None)]
 
 
 @MODULES
-@pytest.mark.parametrize("count", [2, MOST + 1])
+@pytest.mark.parametrize("count", [2, MOST_PIECES + 1])
 def test_the_last_of_few_and_of_many_robots_and_boxes_is_met(xp: ModuleType, count: int) -> None:
     """Puts robot 0 at the origin, with the last box ahead of it and the last robot on its left."""
     pose = np.array([[0.0, -2.0 - 0.2 * i, 0.0] for i in range(count)], np.float32)
