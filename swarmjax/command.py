@@ -69,7 +69,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.reproduce": {
         "": "all arms, ten seeds each: hours",
         "seeds=3 budget=100000": "a first look, in minutes",
-        "'arms=[curriculum,baseline]' device=cpu": "two arms, without the GPU",
+        "'arms=[curriculum,baseline]'": "two arms",
         "minutes=55 out=runs/paper": "stop after 55 minutes, with all saved",
         "resume=runs/paper": "go on with a reproduction that was stopped",
     },

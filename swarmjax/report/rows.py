@@ -75,6 +75,17 @@ MAP = ValueKind("keys and values", lambda value: isinstance(value, dict))
 SHARES = ValueKind("shares by stage", MAP.fits)
 
 
+def list_of(kind: ValueKind, count: int) -> ValueKind:
+    """Makes the kind of a list with this many values of a kind, at least one."""
+    name = f"list of {count} {kind.name}s"
+    return ValueKind(
+        name,
+        lambda value: (
+            isinstance(value, list) and len(value) == count > 0 and all(map(kind.fits, value))
+        ),
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class History:
     """The results of a run at the updates that all of its seeds have recorded.

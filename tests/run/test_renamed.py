@@ -7,7 +7,6 @@ from sentences import refusal
 
 from swarmjax.config import build, to_dict
 from swarmjax.config.section import modernise
-from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
 from swarmjax.run.load_settings import from_stored, load_resume, load_train
 from swarmjax.run.settings import TrainConfig
 
@@ -29,11 +28,6 @@ GONE = ("contact_limit", "contact_price_rate", "contact_price_arrivals")
 @pytest.mark.parametrize(("old", "new"), [(old, new) for old, (new, _) in RENAMED.items()])
 def test_an_old_key_is_refused_with_its_new_name(old: str, new: str) -> None:
     assert refusal(load_train, [f"{old}=1"]) == f"{old} is called {new} now: give {new}."
-
-
-def test_an_old_key_of_the_reproduction_is_refused_with_its_new_name() -> None:
-    sentence = "rollout is called rollout_length now: give rollout_length."
-    assert refusal(load_reproduce, ["rollout=64"]) == sentence
 
 
 def test_stored_settings_are_read_by_their_old_names() -> None:
@@ -64,11 +58,6 @@ def test_a_stored_key_that_was_never_one_is_refused() -> None:
 def test_what_is_no_section_is_left_for_the_reader_to_refuse() -> None:
     assert modernise(TrainConfig, 3) == 3
     assert modernise(TrainConfig, {"algo": 3}) == {"algo": 3}
-
-
-def test_a_stored_reproduction_is_read_by_its_old_name() -> None:
-    stored = modernise(ReproduceConfig, {"rollout": 64, "epochs": 2})
-    assert build(ReproduceConfig, stored).rollout_length == 64
 
 
 @pytest.mark.parametrize("key", GONE)
