@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from rich.progress import Progress
 
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, section, to_dict
+from swarmjax.evaluate import trials
 from swarmjax.exit_codes import FAILED
 from swarmjax.pages import builder
 from swarmjax.reproduce import arms, judge, page
@@ -105,7 +107,10 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
     progress.disable = not progress.console.is_terminal
     with progress:
         bar = progress.add_task("policies judged", total=len(tasks))
-        rows += judge.judge(given, tasks, lambda: progress.advance(bar))
+        workers = min(given.workers or provenance.cores(), max(1, len(tasks)))
+        for row in trials.work(partial(judge.judge, given.episodes), tasks, workers):
+            rows.append(row)
+            progress.advance(bar)
     _write(out / EVALUATION, {"rows": rows})
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -122,25 +122,21 @@ def curves(
 
 def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) -> None:
     """Draws the rolling means of an arm."""
-    found = []
+    seeds = []
     for log in data.logs[arm]:
         chosen = log.on(panel.stage)
         at = measures.along(chosen, axis)[WINDOW - 1 :]
-        found.append((at, measures.rolling(np.asarray(panel.of(chosen), float))))
-        place.plot(*_thinned(*found[-1]), color=COLOURS[arm], lw=0.5, alpha=0.35)
-    shared = measures.on_grid(found, _POINTS)
+        means = measures.rolling(np.asarray(panel.of(chosen), float))
+        seeds.append((at, means))
+        every = max(1, len(at) // 500)  # about one point per pixel
+        place.plot(at[::every], means[::every], color=COLOURS[arm], lw=0.5, alpha=0.35)
+    shared = measures.on_grid(seeds, _POINTS)
     if shared is None:
         return
     band = curve(shared[1], resamples=_RESAMPLES)
     place.fill_between(shared[0], band.low, band.high, color=COLOURS[arm], alpha=0.25, lw=0)
     style = _DASHES.get(arm, "-")
     place.plot(shared[0], band.estimate, style, color=COLOURS[arm], lw=2.0)
-
-
-def _thinned(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thins a curve to about one point per pixel."""
-    every = max(1, len(at) // 500)
-    return at[::every], values[::every]
 
 
 def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -> None:
@@ -212,15 +208,8 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
         rows = [columns(log, success, axis, stage, edges) for log in data.logs[arm]]
         extent = (float(edges[0]), float(edges[-1]), seeds - 0.5, -0.5)
         panel.set_facecolor(_NOTHING)
-        panel.imshow(
-            np.array(rows),
-            _REACHED,
-            vmin=0.0,
-            vmax=1.0,
-            aspect="auto",
-            interpolation="nearest",
-            extent=extent,
-        )
+        look = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
+        panel.imshow(np.array(rows), _REACHED, Normalize(0.0, 1.0), **look)
         places = measures.steady_at(data, arm, success=success, axis=axis, stage=stage)
         panel.scatter(places, range(seeds), s=16, marker="v", color=_STEADY, ec="black", lw=0.5)
         if axis == "episode" and arm in PAPER:
@@ -262,8 +251,8 @@ def columns(
     ended = np.bincount(column, minlength=count) > 0
     following = np.searchsorted(at, edges[1:], side="left")
     under_way = np.append(value, np.nan)[following]
-    found = np.where(shows > 0, wins / np.maximum(shows, 1), np.nan)
-    return np.where(ended, found, under_way)
+    share = np.where(shows > 0, wins / np.maximum(shows, 1), np.nan)
+    return np.where(ended, share, under_way)
 
 
 def _edges(logs: list[RunLog], axis: Axis) -> np.ndarray:

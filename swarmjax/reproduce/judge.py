@@ -4,8 +4,7 @@ Every policy drives by its mean action on the last stage and in the 1.5 m arena.
 only in their sensor noise.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,13 +12,11 @@ import numpy as np
 
 from swarmjax import policy_file
 from swarmjax.config import build
-from swarmjax.evaluate import cells, trials
+from swarmjax.evaluate import cells
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.provenance import cores
 from swarmjax.replay.record import Recording, record
 from swarmjax.report.rows import Row
-from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.load_settings import from_stored
 from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig
@@ -36,35 +33,20 @@ class Task(NamedTuple):
     stage: str
 
 
-def judge(
-    given: ReproduceConfig,
-    tasks: Sequence[Task],
-    report: Callable[[], None] = lambda: None,
-) -> list[Row]:
-    """Judges policies in several processes.
+def judge(episodes: int, task: Task) -> Row:
+    """Judges one policy on one stage.
 
     Args:
-      given: settings of the reproduction, with the number of episodes and processes.
-      tasks: the tasks to judge.
-      report: called whenever a task is done.
+      episodes: number of episodes.
+      task: the policy and the stage.
 
     Returns:
-      A row of `evaluation.json` for each task.
+      A row of `evaluation.json`.
 
     Raises:
-      PolicyError: if a policy is invalid.
+      PolicyError: if the policy is invalid.
       ConfigError: if the physics breaks down.
     """
-    workers = min(given.workers or cores(), max(1, len(tasks)))
-    rows = []
-    for row in trials.work(partial(_judge, given.episodes), tasks, workers):
-        rows.append(row)
-        report()
-    return rows
-
-
-def _judge(count: int, task: Task) -> Row:
-    """Judges one policy on one stage."""
     trained = policy_file.read(str(task.path))
     config = from_stored(trained.meta["config"])
     evaluation = EvaluateConfig(
@@ -75,12 +57,12 @@ def _judge(count: int, task: Task) -> Row:
         realism=config.realism,
         action="mean",
         steps=config.task.step_limit,
-        episodes=count,
+        episodes=episodes,
     )
-    levels = cells.split(cells.draw_stage(evaluation, range(count)).levels)
-    episodes = record(evaluate_judge.load(evaluation, trained), levels)
-    about = {"arm": task.arm, "seed": task.seed, "stage": task.stage, "episodes": count}
-    return about | measure(episodes, config.task.sensor_range)
+    levels = cells.split(cells.draw_stage(evaluation, range(episodes)).levels)
+    recordings = record(evaluate_judge.load(evaluation, trained), levels)
+    about = {"arm": task.arm, "seed": task.seed, "stage": task.stage, "episodes": episodes}
+    return about | measure(recordings, config.task.sensor_range)
 
 
 def measure(episodes: Sequence[Recording], sensor_range: float) -> dict[str, float]:

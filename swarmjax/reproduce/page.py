@@ -88,9 +88,8 @@ def _page(
         lacks=lacks,
         final_heads=("arm", "on", *(label for label, _ in _COLUMNS.values())),
         final=[
-            (arm, stage, *_judged(data, arm, stage, *_COLUMNS))
-            for arm in data.logs
-            for stage in (LAST, EXPANDED)
+            (arm, on, *(_mean(values[key], unit) for key, (_, unit) in _COLUMNS.items()))
+            for (arm, on), values in data.judged.items()
         ],
         window=measures.WINDOW,
         steady_share=100 * measures.STEADY,
@@ -99,14 +98,8 @@ def _page(
         steady=[(*case, *_summary(of_seeds)) for *case, of_seeds in places],
         each_seed=[(*case, *map(PLACE.value, of_seeds)) for *case, of_seeds in places],
         compared=[] if data.lacking(PAIR) else _compared(data),
-        expanded=_expanded(data),
         goals=[claims.evaluate(data, goal) for goal in claims.GOALS],
     )
-
-
-def _judged(data: Reproduction, arm: str, stage: str, *keys: str) -> list[str]:
-    """Writes measures of an arm's final policies on a stage, with their intervals."""
-    return [_mean(data.judged[arm, stage][key], _COLUMNS[key][1]) for key in keys]
 
 
 def _mean(values: np.ndarray, unit: Unit) -> str:
@@ -137,13 +130,3 @@ def _compared(data: Reproduction) -> list[tuple[str, ...]]:
         chance = statistics.probability_of_improvement(theirs, ours)
         rows.append((goal, counted, paired, NUMBER.interval(chance)))
     return rows
-
-
-def _expanded(data: Reproduction) -> list[tuple[str, ...]]:
-    """Makes the table of the share of targets at 1.5 m, zero-shot and trained on."""
-    return [
-        (kind, arm, *_judged(data, arm + ending, EXPANDED, "targets_reached", "all_reached"))
-        for kind, ending in (("zero-shot", ""), ("trained on", "_expanded"))
-        for arm in PAIR
-        if arm + ending in data.logs
-    ]

@@ -14,7 +14,6 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.replay.record import record
 from swarmjax.reproduce import judge as reproduce_judge
-from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.judge import Task
 from swarmjax.reproduce.rows import EXPANDED, LAST
 from swarmjax.run.settings import TrainConfig
@@ -75,10 +74,7 @@ def test_a_row_says_what_became_of_a_policy(tmp_path: Path) -> None:
     )
     path = steering.write(tmp_path / "p.npz", STAY, config=to_dict(trained))
     tasks = [Task("baseline", 3, path, stage) for stage in STAGES]
-    given = ReproduceConfig(episodes=2, workers=1)
-    done: list[None] = []
-    rows = reproduce_judge.judge(given, tasks, lambda: done.append(None))
-    assert len(done) == 2
+    rows = [reproduce_judge.judge(2, task) for task in tasks]
     for row, stage in zip(rows, STAGES, strict=True):
         assert {key: row[key] for key in ("arm", "seed", "stage", "episodes", "steps")} == {
             "arm": "baseline", "seed": 3, "stage": stage, "episodes": 2, "steps": 5.0
