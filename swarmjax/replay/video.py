@@ -16,9 +16,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from swarmjax import epuck
+from swarmjax import epuck, outputs
 from swarmjax.config import ConfigError
-from swarmjax.outputs import replacing
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Recording, ReplayEpisode
@@ -80,16 +79,20 @@ def write(
       report: Called after each picture with the number of pictures added.
 
     Raises:
-      OSError: If the file cannot be written.
+      ConfigError: If the file cannot be written.
     """
     import imageio.v2 as imageio
 
-    with replacing(path) as temporary:
-        film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
-        with film:
-            for picture in _pictures(settings, episodes):
-                film.append_data(picture)
-                report(1)
+    try:
+        with outputs.replacing(path) as temporary:
+            film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
+            with film:
+                for picture in _pictures(settings, episodes):
+                    film.append_data(picture)
+                    report(1)
+        outputs.note([path])
+    except OSError as error:
+        raise outputs.unwritable("video", path, error) from None
 
 
 def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
