@@ -1,18 +1,17 @@
 """Draws the figures of a report with Matplotlib.
 
-The colour maps cividis and viridis rise evenly in lightness, so shares can also be read without
-colours (Crameri et al. 2020, "The misuse of colour in science communication").
+The colour map viridis rises evenly in lightness, so stages can also be told apart without colours
+(Crameri et al. 2020, "The misuse of colour in science communication").
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Normalize
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -20,7 +19,6 @@ from matplotlib.ticker import MaxNLocator
 from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
-from swarmjax.task.stage_config import StageConfig
 
 _POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
 _NAMED = 24  # stages named along a colour strip; more names would overlap
@@ -35,19 +33,17 @@ _CURVES = {
     "value_loss": "value loss",
 }
 
-type Cell = tuple[int, int, tuple[float, float]]  # robots, obstacles, side
-
 
 def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, `curves` if the run recorded them, `levels` if it has a
-      curriculum over levels, and `grid` if the stages make one. The same run gives the same files,
-      since they do not hold Matplotlib's version.
+      PNG files by name: `mix`, `success`, `curves` if the run recorded them, and `levels` if it has
+      a curriculum over levels. The same run gives the same files, since they do not hold
+      Matplotlib's version.
     """
     files = {}
-    makers = {"mix": mix, "success": success, "curves": curves, "levels": levels, "grid": grid}
+    makers = {"mix": mix, "success": success, "curves": curves, "levels": levels}
     for name, make in makers.items():
         figure = make(history)
         if figure is not None:
@@ -83,9 +79,8 @@ def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
     for i, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))):
         _curve(axes, steps, mean[:, i], lately[:, i], color=colour, lw=1.6)
     axes.set(xlim=(0, steps[-1]), xlabel=_STEPS)
-    axes.set_title(title, loc="left", fontsize=10, pad=3)
-    axes.grid(visible=True, alpha=0.25)
     axes.xaxis.set_major_formatter(drawing.thousands())
+    drawing.dress(axes, title)
     if values is history.success:
         axes.set_ylim(0, 1.02)
         axes.yaxis.set_major_formatter(drawing.percent())
@@ -160,9 +155,7 @@ def curves(history: History) -> Figure | None:
         for seed in seeds:
             panel.plot(steps, seed, color=_SEED, lw=0.7)
         panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
-        panel.set_title(title, loc="left", fontsize=10, pad=3)
-        panel.grid(visible=True, alpha=0.25)
-        panel.tick_params(labelsize=9)
+        drawing.dress(panel, title)
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
     panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
@@ -197,8 +190,7 @@ def levels(history: History) -> Figure | None:
         for i, colour in enumerate(colours):
             steps, seeds = _stretched(history.arena_steps, values[..., i])
             panel.plot(steps, report_rows.together(seeds), color=colour, lw=1.6)
-        panel.set_title(title, loc="left", fontsize=10, pad=3)
-        panel.grid(visible=True, alpha=0.25)
+        drawing.dress(panel, title)
         panel.set_ylim(bottom=0.0)
     panels[0].set_xlim(0, history.arena_steps[-1])
     panels[0].xaxis.set_major_formatter(drawing.thousands())
@@ -212,55 +204,6 @@ def levels(history: History) -> Figure | None:
 def _shares(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Divides counts; gives nan where nothing was counted."""
     return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
-
-
-def grid(history: History) -> Figure | None:
-    """Draws the last success of each cell, robots by side, one panel per number of obstacles.
-
-    Returns None if the stages of the run make no grid.
-    """
-    cells = cells_of(history.config.stage)
-    if cells is None:
-        return None
-    last, _ = report_rows.among(history.success[:, -1])
-    robots, obstacles, sides = (sorted(set(axis)) for axis in zip(*cells, strict=True))
-    columns = min(len(obstacles), 4)
-    rows = math.ceil(len(obstacles) / columns)
-    wide = 0.55 if all(low == high for low, high in sides) else 0.85
-    size = (1.6 + columns * (0.4 + wide * len(sides)), 0.9 + rows * (0.5 + 0.55 * len(robots)))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for panel, count in zip(panels, obstacles, strict=False):
-        table = np.full((len(robots), len(sides)), -1)
-        for (r, o, side), stage in cells.items():
-            if o == count:
-                table[robots.index(r), sides.index(side)] = stage
-        _heat(panel, table, last)
-        panel.set_title(f"{count} obstacle{'s' * (count != 1)}", fontsize=10)
-        panel.set_xticks(range(len(sides)), [report_rows.side_text(side) for side in sides])
-        panel.set_yticks(range(len(robots)), [str(r) for r in robots])
-    for panel in panels[len(obstacles) :]:
-        panel.set_visible(False)
-    figure.supxlabel("side of the arena (m)", fontsize=10)
-    figure.supylabel("robots", fontsize=10)
-    scale = ScalarMappable(Normalize(0.0, 1.0), "cividis")
-    bar = figure.colorbar(scale, ax=panels, format=drawing.percent())
-    bar.set_label(f"{report_rows.measure(history)}, at last")
-    return figure
-
-
-def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
-    """Finds the stage of each cell robots x obstacles x side; None if the stages make no grid.
-
-    The stages make a grid if no two share a cell, at least two axes have several values, and at
-    least half of all cells are there. A grid may lack cells whose arena is too small for the
-    robots and obstacles.
-    """
-    cells = {(stage.robots, stage.obstacles, stage.sides): i for i, stage in enumerate(stages)}
-    lengths = [len(set(axis)) for axis in zip(*cells, strict=True)]
-    several = sum(length > 1 for length in lengths)
-    whole = len(cells) == len(stages) and 2 * len(cells) >= math.prod(lengths)
-    return cells if whole and several > 1 else None
 
 
 def _at(updates: int, points: int) -> np.ndarray:
@@ -303,17 +246,13 @@ def _curve(
 
 def _mark(panel: Axes, history: History, stage: int) -> None:
     """Writes a panel's name and last share, and draws the share that promotes."""
-    small = len(history.names) > report_rows.MANY
     last, measured = report_rows.among(history.success[:, -1])
-    figure = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
-    panel.set_title(
-        f"{history.names[stage]}   {figure}", loc="left", fontsize=7 if small else 10, pad=3
-    )
+    share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
+    small = len(history.names) > report_rows.MANY
+    drawing.dress(panel, f"{history.names[stage]}   {share}", 7 if small else 10)
     promoting = _promoting(history)
     if promoting is not None:
         panel.axhline(promoting, color=_LIMIT, lw=0.8, ls="--")
-    panel.grid(visible=True, alpha=0.25)
-    panel.tick_params(labelsize=7 if small else 9)
 
 
 def _explain_lines(figure: Figure, history: History) -> None:
@@ -351,17 +290,3 @@ def _label_outer(figure: Figure, history: History) -> None:
     panel.yaxis.set_major_formatter(drawing.percent())
     figure.supxlabel(_STEPS, fontsize=10)
     figure.supylabel(report_rows.measure(history), fontsize=10)
-
-
-def _heat(panel: Axes, table: np.ndarray, last: np.ndarray) -> None:
-    """Draws a table of stage indices as coloured cells with their numbers; -1 is an empty cell."""
-    values = np.where(table < 0, np.nan, last[table])
-    panel.set_facecolor("0.93")
-    panel.imshow(values, "cividis", Normalize(0.0, 1.0), aspect="auto", origin="lower")
-    for (row, column), stage in np.ndenumerate(table):
-        value = values[row, column]
-        if stage < 0 or np.isnan(value):
-            text, colour = ("" if stage < 0 else "-"), "black"
-        else:
-            text, colour = f"{100 * value:.0f}", "white" if value < 0.55 else "black"
-        panel.text(column, row, text, color=colour, ha="center", va="center", fontsize=9)

@@ -72,7 +72,6 @@ NUMBER_OR_NULL = ValueKind("number", lambda value: value is None or NUMBER.fits(
 NAME = ValueKind("name", lambda value: isinstance(value, str))
 FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
 MAP = ValueKind("keys and values", lambda value: isinstance(value, dict))
-SHARES = ValueKind("shares by stage", MAP.fits)
 
 
 def list_of(kind: ValueKind, count: int) -> ValueKind:
@@ -328,9 +327,6 @@ def _read_decisions(run: Path) -> list[Row]:
     for where, row in read_lines(run, recorder.DECISIONS):
         check(row, ("seed", "update"), WHOLE, where)
         check(row, ("targets_reached", "all_reached"), NUMBER_OR_NULL, where)
-        weights = row.get("weights", {})
-        check({"weights": weights}, ("weights",), SHARES, where)
-        check(weights, weights, NUMBER_OR_NULL, f"{where}, weights,")
         found.append(row)
     return sorted(found, key=lambda row: (row["seed"], row["update"]))
 
