@@ -14,10 +14,9 @@ from swarmjax.report import rows
 from swarmjax.report.rows import History
 from swarmjax.run.directory import METRICS, check_regular
 from swarmjax.run.errors import CheckpointError
-from swarmjax.watch import newest
+from swarmjax.watch import newest, status
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.newest import Newest
-from swarmjax.watch.standing import stand
 
 LOOKED_AT_S = 15.0  # the page counts as open for this long after its last request
 PAUSE_S = 0.5  # seconds between two checks of the directory
@@ -90,10 +89,10 @@ class Views:
         """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
         drawn, replayed = self.drawn, self.replayed
-        standing = stand(self.run, self.trained)
+        now = status.read(self.run, self.trained)
         return {
-            "state": standing.state,
-            "sentence": standing.sentence,
+            "state": now.state,
+            "sentence": now.sentence,
             "facts": [] if drawn.history is None else report_page.facts(drawn.history),
             "figures": {"version": drawn.version, "names": list(drawn.figures)},
             "trouble": drawn.trouble,
@@ -106,8 +105,8 @@ class Views:
 
     def draw(self) -> float:
         """Redraws the figures if the run has logged more, and returns the seconds to rest."""
-        found = _version(self.run / METRICS)
-        if found is None or found == self._seen:
+        version = _version(self.run / METRICS)
+        if version is None or version == self._seen:
             return 0.0
         began = time.perf_counter()
         try:
@@ -117,7 +116,7 @@ class Views:
             self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
-        self._seen = found
+        self._seen = version
         return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
 
     def replay(self) -> float:
@@ -131,8 +130,8 @@ class Views:
             return 0.0
         self._tried = update
         try:
-            found = newest.record(self.settings, self.drawn.history)
-            self.replayed = Replayed(self.replayed.version + 1, found)
+            replay = newest.record(self.settings, self.drawn.history)
+            self.replayed = Replayed(self.replayed.version + 1, replay)
         except (ConfigError, CheckpointError, PolicyError, OSError) as error:
             self.replayed = self.replayed._replace(trouble=str(error))
         return self.settings.seconds
@@ -153,10 +152,10 @@ class Views:
 def _version(path: Path) -> tuple[int, float] | None:
     """Returns a file's size and time, to detect changes; None if it is missing or empty."""
     try:
-        found = path.stat()
+        file = path.stat()
     except OSError:
         return None
-    return (found.st_size, found.st_mtime) if found.st_size else None
+    return (file.st_size, file.st_mtime) if file.st_size else None
 
 
 def figures(history: History) -> dict[str, bytes]:
