@@ -22,7 +22,6 @@ from swarmjax.report.rows import History
 
 _POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
 _NAMED = 24  # stages named along a colour strip; more names would overlap
-SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _STEPS = "arena control steps per seed"
 _CURVES = {
@@ -51,52 +50,12 @@ def draw(history: History) -> dict[str, bytes]:
     return files
 
 
-def by_stage(history: History) -> dict[str, Figure]:
-    """Draws each stage's newest verdict over time, one colour per stage, small enough for a phone.
-
-    A line is the interquartile mean over seeds, drawn where every seed has a value. It is dotted
-    where the stage is no longer trained on.
-
-    Returns:
-      One figure each for `targets`, `contacts` and `return`.
-    """
-    measures = {
-        "targets": (report_rows.measure(history), history.success),
-        "contacts": ("contacts per robot", history.by_stage["contacts_by_stage"]),
-        "return": ("return per robot", history.by_stage["return_by_stage"]),
-    }
-    return {key: _of_stages(history, *each) for key, each in measures.items()}
-
-
-def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
-    """Draws values [N, T, S] of all stages into one panel."""
-    at = _at(len(history.updates), _POINTS)
-    steps = history.arena_steps[at]
-    lately = report_rows.trained_lately(history)[:, at].any(axis=0)
-    mean = report_rows.together(values)[at]
-    figure = Figure(figsize=SMALL, layout="constrained")
-    axes = figure.subplots()
-    for i, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))):
-        _curve(axes, steps, mean[:, i], lately[:, i], color=colour, lw=1.6)
-    axes.set(xlim=(0, steps[-1]), xlabel=_STEPS)
-    axes.xaxis.set_major_formatter(drawing.thousands())
-    drawing.dress(axes, title)
-    if values is history.success:
-        axes.set_ylim(0, 1.02)
-        axes.yaxis.set_major_formatter(drawing.percent())
-    if np.isnan(mean).all():
-        axes.text(0.5, 0.5, "not measured yet", transform=axes.transAxes, ha="center")
-    if len(history.names) > 1:
-        _name_colours(figure, axes, history.names)
-    return figure
-
-
-def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> Figure:
-    """Draws each stage's share of the arenas, stacked, as the mean over seeds; `size` in inches."""
+def mix(history: History) -> Figure:
+    """Draws each stage's share of the arenas, stacked, as the mean over seeds."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
     # The mix of an update holds from the end of the update before it.
     axes.stackplot(

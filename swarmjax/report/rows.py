@@ -30,8 +30,6 @@ BY_STAGE = (
     "complete_by_stage",
     "contacts_by_stage",
     "return_by_stage",
-    "progress_by_stage",
-    "episodes_by_stage",
 )
 _LISTS = ("mix", "weights", *BY_STAGE)
 # What the curriculum over levels did on each stage, if there is one.

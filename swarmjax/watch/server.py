@@ -17,7 +17,7 @@ from typing import Any
 
 from swarmjax.config import ConfigError
 from swarmjax.pages import builder
-from swarmjax.watch.view import NAMES, Views
+from swarmjax.watch.view import Views
 
 ADDRESS = "127.0.0.1"
 # The page may load only from its own server: the requests of its script, and the replay's frame.
@@ -51,7 +51,6 @@ class Server(ThreadingHTTPServer):
             script=builder.read("watch/watch.js"),
             sources=_SOURCES,
             title=f"Watching {views.run}",
-            figures=NAMES,
         )
         self._begun: dict[socket.socket, float] = {}
         try:

@@ -23,15 +23,6 @@ PAUSE_S = 0.5  # seconds between two checks of the directory
 # Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
 
-NAMES = {
-    "targets": "Success of each stage, its newest verdict, over arena control steps",
-    "contacts": "Contacts per robot of each stage, its newest verdict, over arena control steps",
-    "return": "Return per robot of each stage, its newest verdict, over arena control steps",
-    "mix": "On which stages the arenas were, over arena control steps",
-    "levels": "Levels kept for replay: their number, the share of episodes that began on them, and "
-    "their success and score, over arena control steps",
-}
-
 
 class DrawnFigures(NamedTuple):
     """Figures of a run.
@@ -39,7 +30,7 @@ class DrawnFigures(NamedTuple):
     Attributes:
       version: increases with each drawing.
       history: the results that the figures show; None before the first update.
-      figures: PNG files by the names in `NAMES`.
+      figures: PNG files by name.
       trouble: why the newest drawing failed; empty if it did not.
     """
 
@@ -108,12 +99,14 @@ class Views:
         version = _version(self.run / METRICS)
         if version is None or version == self._seen:
             return 0.0
+        from swarmjax.report import figures  # Matplotlib takes a second
+
         began = time.perf_counter()
         try:
             check_regular(self.run)
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
-            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
+            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures.draw(history))
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
         self._seen = version
@@ -156,21 +149,3 @@ def _version(path: Path) -> tuple[int, float] | None:
     except OSError:
         return None
     return (file.st_size, file.st_mtime) if file.st_size else None
-
-
-def figures(history: History) -> dict[str, bytes]:
-    """Draws the figures of a run.
-
-    Returns:
-      PNG files by the names in `NAMES`, without figures that would show nothing.
-    """
-    from swarmjax.pages import figures as drawing  # Matplotlib takes a second
-    from swarmjax.report import figures as report_figures
-
-    made = report_figures.by_stage(history)
-    if len(history.names) > 1:
-        made["mix"] = report_figures.mix(history, report_figures.SMALL)
-    levels = report_figures.levels(history)
-    if levels is not None:
-        made["levels"] = levels
-    return {name: drawing.png(figure) for name, figure in made.items()}

@@ -17,7 +17,6 @@ from swarmjax.run.display import LevelsState, summarize
 from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.training import practice
-from swarmjax.watch import view
 from tests.runs import CONFIG, row, write
 
 LEVELS = LevelsConfig(mode="learnability", buffer=8)
@@ -53,16 +52,9 @@ def test_rows_are_read_by_stage(tmp_path: Path) -> None:
     np.testing.assert_array_equal(history.levels["levels_success"][0, -1], [0.5, np.nan])
 
 
-def test_the_page_of_a_running_run_shows_the_levels(tmp_path: Path) -> None:
-    drawn = view.figures(rows.read(_run(tmp_path)))
-    assert drawn["levels"].startswith(b"\x89PNG")
-    assert set(drawn) <= set(view.NAMES)
-
-
 def test_a_run_without_a_buffer_has_no_figure_of_levels(tmp_path: Path) -> None:
     history = rows.read(write(tmp_path, [row(i) for i in range(4)]))
     assert history.levels is None
-    assert "levels" not in view.figures(history)
     assert figures.levels(history) is None
     assert levels.read(tmp_path, history.config) is None
 

@@ -73,9 +73,9 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     browser.get(server.url)
     wait = WebDriverWait(browser, 60)
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
-    wait.until(lambda _: browser.execute_script(drawn) == 4)
-    standing = browser.find_element("id", "standing")
-    assert standing.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
+    wait.until(lambda _: browser.execute_script(drawn) == 2)
+    status = browser.find_element("id", "status")
+    assert status.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
     assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
     assert "by the policy of seed 0" in browser.find_element("id", "seen").text
     browser.switch_to.frame("replay")
@@ -92,7 +92,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     }
     paths = {url.removeprefix(server.url) for url in asked if url.startswith(server.url)}
     assert len(paths) == len(asked - {"data:,"})  # the icon is an empty data URL
-    assert {"", "state.json", "figures/targets.png?1", "replay.html?1"} <= paths
+    assert {"", "state.json", "figures/success.png?1", "replay.html?1"} <= paths
     assert browser.get_log("browser") == []  # no errors, no breach of the security policy
 
 

@@ -101,7 +101,7 @@ def test_it_listens_on_the_loopback_alone(server: Server) -> None:
         ("/", "text/html; charset=utf-8"),
         ("/?a=b", "text/html; charset=utf-8"),
         ("/state.json", "application/json"),
-        ("/figures/targets.png", "image/png"),
+        ("/figures/success.png", "image/png"),
         ("/figures/mix.png?2", "image/png"),
     ],
 )
@@ -188,7 +188,7 @@ def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None
     views.draw()
     state = views.state()
     assert "in line 2" in state["trouble"]
-    assert "targets" in state["figures"]["names"]
+    assert "success" in state["figures"]["names"]
 
 
 def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None:
