@@ -128,7 +128,7 @@ _TINY: dict[str, list[str]] = {
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
     "replay": ["steps=2", "episodes=1", "workers=1"],
     "suite": ["write=false"],
-    "reproduce": ["minutes=0.0001", "device=cpu"],
+    "reproduce": ["minutes=0.0001"],
     "export": [],
     "report": [],
 }
@@ -185,7 +185,8 @@ def _write_run(run: Path) -> None:
     lists = {key: [0.5] for key in ("mix", "weights", *rows.BY_STAGE)}
     row = {"update": 1, "seed": 0, "arena_steps": 4096, "train_s": 1.0, "return": 0.1, **lists}
     (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
-    (run / "reproduce.json").write_text(json.dumps({"settings": to_dict(ReproduceConfig())}))
+    facts = {"format": 3, "settings": to_dict(ReproduceConfig()), "versions": {}}
+    (run / "reproduce.json").write_text(json.dumps(facts))
 
 
 def _spoil(name: str, draw: random.Random) -> None:

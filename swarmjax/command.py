@@ -56,7 +56,6 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.watch": {
         "run=runs/first": "serve a page on this machine, and print its address",
         "run=runs/first port=8000 seconds=10": "on a port of your choice, with more replays",
-        "run=runs/first level=7 seed=1": "another level, by another seed's policy",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
@@ -69,7 +68,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.reproduce": {
         "": "all arms, ten seeds each: hours",
         "seeds=3 budget=100000": "a first look, in minutes",
-        "'arms=[curriculum,baseline]' device=cpu": "two arms, without the GPU",
+        "'arms=[curriculum,baseline]'": "two arms",
         "minutes=55 out=runs/paper": "stop after 55 minutes, with all saved",
         "resume=runs/paper": "go on with a reproduction that was stopped",
     },

@@ -62,6 +62,40 @@ def check(key: str, paths: Iterable[Path], *, overwrite: bool) -> None:
             )
 
 
+def make_room(key: str, path: Path, folder: Path | None = None) -> None:
+    """Makes the folder of an output before the command does its work, so that no result is lost.
+
+    Args:
+      key: the key that names the output, for the message.
+      path: the file; or the folder, if there are several files.
+      folder: the folder of the files; None: that of the file.
+
+    Raises:
+      ConfigError: if nothing can be written there.
+    """
+    try:
+        (folder or path.parent).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(key, path, error) from None
+    if folder is None and path.is_dir():
+        raise unwritable(key, path, "it is a folder")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise unwritable(key, path, "permission denied")
+
+
+def unwritable(key: str, path: Path, reason: OSError | str) -> ConfigError:
+    """Makes the error for an output that cannot be written.
+
+    Args:
+      key: the key that names it.
+      path: the file or folder.
+      reason: why.
+    """
+    if isinstance(reason, OSError):
+        reason = reason.strerror or str(reason)
+    return ConfigError(f"{key} is {path}, which cannot be written: {reason}.")
+
+
 def note(paths: Iterable[Path]) -> None:
     """Notes the digests of files that a command has written, so that it may replace them later.
 

@@ -7,19 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.reproduce.rows import ARMS, EXPANDED, JUDGED, LAST, Reproduction, RunLog
+from swarmjax.config import to_dict
+from swarmjax.reproduce.config import ARMS, ReproduceConfig
+from swarmjax.reproduce.rows import EXPANDED, JUDGED, LAST, Reproduction, RunLog
 
 SEEDS = (0, 1, 2)
-FACTS = {
-    "format": 2,
-    "settings": {"seeds": 3, "budget": 1e6, "out": "somewhere", "sim": {"impl": "jax"}},
-    "seeds": list(SEEDS),
-    "budget": 1_000_000,
-    "fine_tune": 250_000,
-    "device": {"curriculum": "CPU x86_64, 2 cores"},
-    "versions": {"jax": "0.11.2"},
-    "commit": {"curriculum": "60ed72f"},
-    "compile_s": {},
+VERSIONS = {"jax": "0.11.2"}
+SUMMARY = {
+    "budget_spent": True,
+    "device": "CPU x86_64, 2 cores",
+    "commit": "60ed72f",
+    "train_s": 60.0,
+    "compile_s": 60.0,
 }
 
 
@@ -53,26 +52,27 @@ def write(
     out: Path,
     logs: Mapping[str, Sequence[Mapping[str, Any]]],
     judged: Sequence[Mapping[str, Any]] | None = None,
-    **facts: Any,
+    seeds: int = len(SEEDS),
 ) -> Path:
     """Writes a directory in which the arms in `logs` have finished."""
-    finished = dict.fromkeys(logs, 60.0)
     out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(FACTS | {"seconds": finished, "compile_s": finished} | facts)
-    (out / "reproduce.json").write_text(text)
+    settings = to_dict(ReproduceConfig(seeds=seeds))
+    facts = {"format": 3, "settings": settings, "versions": VERSIONS}
+    (out / "reproduce.json").write_text(json.dumps(facts))
     for arm, episodes in logs.items():
         (out / arm).mkdir(exist_ok=True)
         lines = "".join(json.dumps(each) + "\n" for each in episodes)
         (out / arm / "episodes.jsonl").write_text(lines)
+        (out / arm / "summary.json").write_text(json.dumps(SUMMARY))
     if judged is None:
         stages = (LAST, EXPANDED)
         judged = [row(arm, seed, stage) for arm in logs for seed in SEEDS for stage in stages]
-    text = json.dumps({"format": 2, "rows": list(judged)})
+    text = json.dumps({"format": 3, "rows": list(judged)})
     (out / "evaluation.json").write_text(text)
     return out
 
 
-def whole(out: Path, episodes: int = 30, arms: Sequence[str] = tuple(ARMS)) -> Path:
+def whole(out: Path, episodes: int = 30, arms: Sequence[str] = ARMS) -> Path:
     """Writes arms that fail only in their first ten episodes (baselines in their first twelve)."""
     logs = {}
     for arm in arms:
@@ -120,8 +120,9 @@ def reproduction(
     arms = [*logs, *(arm for arm, _ in judged if arm not in logs)]
     zero = dict.fromkeys(JUDGED, 0.0)
     return Reproduction(
-        facts=FACTS | {"seconds": dict.fromkeys(arms, 60.0)},
-        seeds=SEEDS,
+        settings=ReproduceConfig(seeds=len(SEEDS)),
+        versions=VERSIONS,
+        summaries=dict.fromkeys(arms, SUMMARY),
         logs={arm: tuple(logs.get(arm, [log([True] * 30)] * len(SEEDS))) for arm in arms},
         judged={
             (arm, stage): {

@@ -26,7 +26,7 @@ ROOMS = {
     "replay": SHARED | {"sim", "task", "evaluate", "export", "pages"},
     "report": SHARED | {"task", "run", "evaluate", "pages"},
     "adapters": {"environment"},
-    "reproduce": SHARED | {"sim", "task", "run", "evaluate", "pages", "report"},
+    "reproduce": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
     "shell": SHARED,
     "watch": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
 }

@@ -5,7 +5,6 @@ module joins them, and writes and shows the result.
 """
 
 import json
-import os
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -15,7 +14,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command, outputs
-from swarmjax.config import ConfigError
 from swarmjax.evaluate import table as evaluate_table
 from swarmjax.evaluate import unfinished, witness
 from swarmjax.evaluate.config import EvaluateConfig
@@ -36,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     if out is not None and keep is not None:
         written = [*_files(out), keep / unfinished.ABOUT]
         outputs.check("out", written, overwrite=settings.overwrite)
-        _check_out(out)
+        outputs.make_room("out", out, None if out.suffix == ".json" else out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     try:
@@ -84,20 +82,6 @@ def _files(out: Path) -> list[Path]:
     return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
-def _check_out(path: Path) -> None:
-    """Makes the result's folder before the work starts, so that no result can be lost."""
-    is_file = path.suffix == ".json"
-    folder = path.parent if is_file else path
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(path, error.strerror) from None
-    if is_file and path.is_dir():
-        raise _unwritable(path, "it is a folder")
-    if not os.access(path if path.exists() else folder, os.W_OK):
-        raise _unwritable(path, "permission denied")
-
-
 def _write(path: Path, found: Evaluation, limit: float) -> None:
     """Writes a JSON file, or a folder with all outputs; `limit` is an episode's length, s."""
     text = json.dumps(found.result, indent=2, allow_nan=False) + "\n"
@@ -113,11 +97,7 @@ def _write(path: Path, found: Evaluation, limit: float) -> None:
             for name, content in figures.draw(found.result, found.trials, limit).items():
                 (path / f"{name}.png").write_bytes(content)
     except OSError as error:
-        raise _unwritable(path, error.strerror) from None
-
-
-def _unwritable(path: Path, reason: str | None) -> ConfigError:
-    return ConfigError(f"out is {path}, which cannot be written: {reason}.")
+        raise outputs.unwritable("out", path, error) from None
 
 
 if __name__ == "__main__":

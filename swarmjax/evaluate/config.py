@@ -26,20 +26,11 @@ AS_TRAINED = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateConfig(Section):
-    """All settings of an evaluation of policies."""
+class JudgeConfig(Section):
+    """The settings of all commands that judge policies: the levels, the robots and the world."""
 
-    command: ClassVar[str] = "evaluate"
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
-    policy: str | None = field(
-        default=None,
-        metadata=about("policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"),
-    )
-    compare: str | None = field(
-        default=None,
-        metadata=about("two recipes instead, compared level by level: a.npz,b.npz, or patterns"),
-    )
     stage: StageConfig
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
@@ -55,9 +46,6 @@ class EvaluateConfig(Section):
             "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
             "the policy's most likely action"
         ),
-    )
-    engine: Literal["c", "mjx"] = field(
-        default="c", metadata=about("c: MuJoCo's C engine; mjx: the engine of training")
     )
     steps: int | None = field(
         default=None,
@@ -80,16 +68,38 @@ class EvaluateConfig(Section):
         default=None,
         metadata=about("Python file with the policies' extension; it is executed"),
     )
-    out: str | None = field(
-        default=None,
-        metadata=about("folder for result.json, levels.csv and plots, or a single .json file"),
-    )
     overwrite: bool = field(default=False, metadata=OVERWRITE)
 
     @property
     def step_limit(self) -> int:
         """Control steps of an episode, unless a cell of a suite has its own number of steps."""
         return STEPS if self.steps is None else self.steps
+
+    def _check(self) -> None:
+        check_realism(self.realism, self.robot, self.task, self.step_limit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig(JudgeConfig):
+    """All settings of an evaluation of policies."""
+
+    command: ClassVar[str] = "evaluate"
+
+    policy: str | None = field(
+        default=None,
+        metadata=about("policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"),
+    )
+    compare: str | None = field(
+        default=None,
+        metadata=about("two recipes instead, compared level by level: a.npz,b.npz, or patterns"),
+    )
+    engine: Literal["c", "mjx"] = field(
+        default="c", metadata=about("c: MuJoCo's C engine; mjx: the engine of training")
+    )
+    out: str | None = field(
+        default=None,
+        metadata=about("folder for result.json, levels.csv and plots, or a single .json file"),
+    )
 
     def _check(self) -> None:
         if (self.policy is None) == (self.compare is None):
@@ -102,4 +112,4 @@ class EvaluateConfig(Section):
                 f"shape is {self.shape}, but stage.level is fixed, with obstacles of its own: "
                 "give shape=box."
             )
-        check_realism(self.realism, self.robot, self.task, self.step_limit)
+        super()._check()

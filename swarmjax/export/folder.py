@@ -35,7 +35,7 @@ def write_file(path: Path, content: bytes) -> None:
             temporary.write_bytes(content)
         outputs.note([path])
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise outputs.unwritable("out", path, error) from None
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -66,7 +66,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             for left in (new, old):
                 shutil.rmtree(left, ignore_errors=True)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise outputs.unwritable("out", path, error) from None
 
 
 def check_folder(path: Path) -> None:
@@ -85,7 +85,7 @@ def check_folder(path: Path) -> None:
             raise ConfigError(f"out is {path}, a file: give a folder.")
         strange = _strange(path)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise outputs.unwritable("out", path, error) from None
     if strange:
         raise ConfigError(
             f"out is {path}, where {strange} is not from an export or was changed since: give "
@@ -108,7 +108,3 @@ def _strange(path: Path) -> str | None:
         if not whole or hashlib.sha256(found.read_bytes()).hexdigest() != listed.get(found.name):
             return found.name
     return None
-
-
-def _unwritable(path: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"out is {path}, which cannot be written: {error.strerror or error}.")

@@ -15,7 +15,6 @@ from typing import Any
 import jinja2
 
 from swarmjax import outputs
-from swarmjax.config import ConfigError
 
 STYLE = "pages/page.css"
 
@@ -108,5 +107,5 @@ def write(out: Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> 
             (out / name).write_bytes(content)
         outputs.note(paths)
     except OSError as error:
-        raise ConfigError(f"out is {out}, which cannot be written: {error.strerror}.") from None
+        raise outputs.unwritable("out", out, error) from None
     return paths

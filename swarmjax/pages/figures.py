@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence
 
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, PercentFormatter
 from PIL import Image
@@ -29,6 +30,13 @@ def png(figure: Figure, shades: int | None = None) -> bytes:
     few = image.quantize(shades, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(small, format="png", optimize=True)
     return small.getvalue()
+
+
+def dress(panel: Axes, title: str, size: float = 10.0) -> None:
+    """Gives a panel its title, in points, and a faint grid."""
+    panel.set_title(title, loc="left", fontsize=size, pad=3)
+    panel.grid(visible=True, alpha=0.25)
+    panel.tick_params(labelsize=min(size, 9.0))
 
 
 def percent() -> PercentFormatter:

@@ -5,10 +5,9 @@ in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown 
 same levels. No JAX.
 """
 
-import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -33,10 +32,10 @@ def main(arguments: Sequence[str]) -> int:
     settings, said = witness.load(ReplayConfig, arguments)
     entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
     out, video = Path(settings.out), settings.video and Path(settings.video)
-    others = [*settings.policies, settings.suite, settings.video]
-    _check_out(out, others, overwrite=settings.overwrite)
+    _check_output("out", out, ".html", settings)
     if video:
-        _check_video(video, [*settings.policies, settings.suite], overwrite=settings.overwrite)
+        _check_output("video", video, ".mp4", settings)
+        replay_video.check()
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     words = shlex.join(["python", "-m", "swarmjax.replay", *arguments])
@@ -47,8 +46,7 @@ def main(arguments: Sequence[str]) -> int:
         if video:
             bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
             report = partial(progress.advance, bar)
-            _write("video", video, lambda: replay_video.write(video, settings, episodes, report))
-            outputs.note([video])
+            replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
         missing = _left_out(settings, each)
@@ -76,50 +74,15 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
     return ", ".join(name for name, weight in earning.extra.items() if weight and name not in found)
 
 
-def _check_file(key: str, path: Path, *, overwrite: bool) -> None:
-    """Makes the folder of a file before the replay is computed, so that no result is lost."""
-    outputs.check(key, [path], overwrite=overwrite)
-    _write(key, path, lambda: path.parent.mkdir(parents=True, exist_ok=True))
-    if path.is_dir():
-        raise _unwritable(key, path, "it is a folder")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise _unwritable(key, path, "permission denied")
-
-
-def _check_out(path: Path, others: Sequence[str | None], *, overwrite: bool) -> None:
-    """Checks that the page can be written and does not overwrite one of the other files."""
-    if path.suffix != ".html":
-        raise ConfigError(f"out is {path}: give a name that ends with .html.")
-    _check_apart("out", path, others)
-    _check_file("out", path, overwrite=overwrite)
-
-
-def _check_apart(key: str, path: Path, others: Sequence[str | None]) -> None:
-    """Checks that a file does not overwrite another one that the command reads or writes."""
-    for other in others:
-        if other is not None and path.resolve() == Path(other).resolve():
-            raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
-
-
-def _check_video(path: Path, others: Sequence[str | None], *, overwrite: bool) -> None:
-    """Checks that the video can be made and written, and overwrites none of the other files."""
-    if path.suffix != ".mp4":
-        raise ConfigError(f"video is {path}: give a name that ends with .mp4.")
-    _check_apart("video", path, others)
-    _check_file("video", path, overwrite=overwrite)
-    replay_video.check()
-
-
-def _write(key: str, path: Path, write: Callable[[], object]) -> None:
-    """Writes a file; turns missing permission or a full disk into a message."""
-    try:
-        write()
-    except OSError as error:
-        raise _unwritable(key, path, error.strerror or str(error)) from None
-
-
-def _unwritable(key: str, path: Path, reason: str) -> ConfigError:
-    return ConfigError(f"{key} is {path}, which cannot be written: {reason}.")
+def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:
+    """Checks that a file can be written, and overwrites no file that the command reads."""
+    if path.suffix != ending:
+        raise ConfigError(f"{key} is {path}: give a name that ends with {ending}.")
+    read = [Path(each) for each in (*settings.policies, settings.suite) if each is not None]
+    if path.resolve() in [each.resolve() for each in read]:
+        raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
+    outputs.check(key, [path], overwrite=settings.overwrite)
+    outputs.make_room(key, path)
 
 
 if __name__ == "__main__":

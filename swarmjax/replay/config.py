@@ -1,47 +1,22 @@
 """The settings of a replay."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import dataclass, field, fields
+from typing import ClassVar
 
-from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate.config import AS_TRAINED, MOST_EPISODES, MOST_STEPS, STEPS, EvaluateConfig
-from swarmjax.outputs import OVERWRITE
-from swarmjax.sim.config import RobotConfig
-from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task.config import TaskConfig, check_realism
-from swarmjax.task.shapes import Shape
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.config import ConfigError, about, show
+from swarmjax.evaluate.config import EvaluateConfig, JudgeConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayConfig(Section):
+class ReplayConfig(JudgeConfig):
     """Settings: which episodes of which policies to show, and where to write the replay."""
 
     command: ClassVar[str] = "replay"
-    inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
-    stage: StageConfig
-    suite: str | None = field(
-        default=None,
-        metadata=about("instead of a stage: a name in configs/suites/, or a .yaml or .npz file"),
-    )
     cell: str | None = field(
         default=None, metadata=about("cell of the suite; null: all cells, only with worst")
-    )
-    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
-    task: TaskConfig = field(default_factory=TaskConfig)
-    realism: RealismConfig = field(default_factory=RealismConfig)
-    shape: Shape = field(default="box", metadata=about("shape of a random level's obstacles"))
-    action: Literal["sampled", "mean"] = field(
-        default="sampled",
-        metadata=about(
-            "actions of the robots; sampled: drawn from the policy, the same for the same level; "
-            "mean: the most likely one"
-        ),
     )
     level: str | None = field(
         default=None,
@@ -51,39 +26,15 @@ class ReplayConfig(Section):
         default=None,
         metadata=about("replay this many of the worst episodes", 1, 100),
     )
-    steps: int | None = field(
-        default=None,
-        metadata=about(
-            f"control steps of an episode; null: as in the suite's cell, else {STEPS}",
-            1,
-            MOST_STEPS,
-        ),
-    )
-    episodes: int = field(
-        default=1000, metadata=about("number of levels to choose from", 1, MOST_EPISODES)
-    )
-    seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
-    workers: int | None = field(
-        default=None, metadata=about("processes for worst; null: one per core", 1, 1024)
-    )
-    substeps: int | None = field(
-        default=None,
-        metadata=about("physics steps per control step; null: the body's default", 1, 1000),
-    )
-    extensions: str | None = field(
-        default=None,
-        metadata=about("Python file with the pieces that the policies need; it is executed"),
-    )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
-    overwrite: bool = field(default=False, metadata=OVERWRITE)
     video_speed: float = field(
         default=1.0,
         metadata=about("seconds of the episode per second of video", 0.05, 100.0),
     )
 
     def _check(self) -> None:
-        check_realism(self.realism, self.robot, self.task, self.steps or STEPS)
+        super()._check()
         if not 1 <= len(self.policies) <= 2 or not all(self.policies):
             raise ConfigError(
                 f"policy is {show(self.policy)}: give one file, or two with a comma between them."
@@ -126,27 +77,9 @@ class ReplayConfig(Section):
         return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
 
     @property
-    def _drawn(self) -> int:
-        """How many levels of a stage are drawn; no more than the named ones need."""
-        is_named = self.worst is None and self.suite is None
-        return max(self.levels) + 1 if is_named else self.episodes
-
-    @property
     def evaluation(self) -> EvaluateConfig:
-        """The evaluation to which the episodes belong."""
-        return EvaluateConfig(
-            policy=self.policy,
-            stage=self.stage,
-            suite=self.suite,
-            robot=self.robot,
-            task=self.task,
-            realism=self.realism,
-            shape=self.shape,
-            action=self.action,
-            steps=self.steps,
-            episodes=self._drawn,
-            seed=self.seed,
-            workers=self.workers,
-            substeps=self.substeps,
-            extensions=self.extensions,
-        )
+        """The evaluation to which the episodes belong; it draws no more levels than needed."""
+        shared = {item.name: getattr(self, item.name) for item in fields(JudgeConfig)}
+        if self.worst is None and self.suite is None:
+            shared["episodes"] = max(self.levels) + 1
+        return EvaluateConfig(policy=self.policy, **shared)

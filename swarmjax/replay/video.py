@@ -16,9 +16,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from swarmjax import epuck
+from swarmjax import epuck, outputs
 from swarmjax.config import ConfigError
-from swarmjax.outputs import replacing
+from swarmjax.pages import builder
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Recording, ReplayEpisode
@@ -26,9 +26,9 @@ from swarmjax.sim.model import HALF_HEIGHT
 
 FRAME_RATE = 30  # 1/s
 HOLD = 1.0  # s; the last frame of an episode stays this long
-HEIGHT = 720  # px; a picture is 16:9, two side by side are 4:3 each
+HEIGHT = 720  # px; a picture is 16:9, two side by side are 4:3 each; as in scene.xml
 ELEVATION = math.radians(58.0)  # of the camera
-FIELD_OF_VIEW = math.radians(40.0)  # vertical
+FIELD_OF_VIEW = math.radians(40.0)  # vertical; as in scene.xml
 _MARGIN = 1.06  # around the arena
 _WALL = 0.015  # m; half of a wall's drawn thickness
 _RAY = 0.0022  # m; half the width of a ray
@@ -80,16 +80,20 @@ def write(
       report: Called after each picture with the number of pictures added.
 
     Raises:
-      OSError: If the file cannot be written.
+      ConfigError: If the file cannot be written.
     """
     import imageio.v2 as imageio
 
-    with replacing(path) as temporary:
-        film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
-        with film:
-            for picture in _pictures(settings, episodes):
-                film.append_data(picture)
-                report(1)
+    try:
+        with outputs.replacing(path) as temporary:
+            film: Any = imageio.get_writer(temporary, fps=FRAME_RATE, quality=7)
+            with film:
+                for picture in _pictures(settings, episodes):
+                    film.append_data(picture)
+                    report(1)
+        outputs.note([path])
+    except OSError as error:
+        raise outputs.unwritable("video", path, error) from None
 
 
 def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
@@ -139,7 +143,7 @@ class _Shot:
 
     def __init__(self, settings: ReplayConfig, recording: Recording, width: int) -> None:
         self.recording = recording
-        self.model = build(settings, recording, width).compile()
+        self.model = build(settings, recording).compile()
         self.data = mujoco.MjData(self.model)
         self.renderer = mujoco.Renderer(self.model, HEIGHT, width)
         self.camera = _camera(recording.scene.side, width / HEIGHT)
@@ -180,20 +184,19 @@ class _Shot:
             scene.ngeom += 1
 
 
-def build(settings: ReplayConfig, recording: Recording, width: int) -> mujoco.MjSpec:
+def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
     """Describes the scene of an episode, with robots as bodies that the video places itself.
 
     Args:
       settings: The replay's settings.
       recording: Recording of the episode.
-      width: Width of a picture, px.
 
     Returns:
       The spec; robot i is the mocap body i.
     """
-    spec = mujoco.MjSpec()
-    _set_visuals(spec, width)
-    _add_floor(spec, recording.scene.side)
+    spec = mujoco.MjSpec.from_string(builder.read("replay/scene.xml"))
+    half = 0.5 * recording.scene.side
+    spec.geom("floor").size = [half, half, 1.0]
     _add_fixtures(spec, recording)
     colours = [_rgba(text) for text in pack.colours(recording.pose.shape[1])]
     for (x, y), colour in zip(recording.scene.target, colours, strict=True):
@@ -202,52 +205,6 @@ def build(settings: ReplayConfig, recording: Recording, width: int) -> mujoco.Mj
     for i, colour in enumerate(colours):
         _add_robot(spec, f"robot{i}", settings.robot.hull_radius, colour)
     return spec
-
-
-def _set_visuals(spec: mujoco.MjSpec, width: int) -> None:
-    """Sets light, background and the size of a picture."""
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, HEIGHT
-    spec.visual.global_.fovy = math.degrees(FIELD_OF_VIEW)
-    spec.visual.quality.shadowsize = 4096
-    spec.visual.headlight.ambient = [0.4, 0.4, 0.4]
-    spec.visual.headlight.diffuse = [0.2, 0.2, 0.2]
-    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.93, 0.94, 0.96],
-        rgb2=[0.80, 0.83, 0.87],
-        width=64,
-        height=64,
-    )
-    spec.worldbody.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=[0.0, 0.0, 3.0],
-        dir=[0.2, 0.3, -1.0],
-        diffuse=[0.4, 0.4, 0.4],
-        specular=[0.1, 0.1, 0.1],
-        castshadow=True,
-    )
-
-
-def _add_floor(spec: mujoco.MjSpec, side: float) -> None:
-    """Adds a floor with squares of 0.1 m."""
-    spec.add_texture(
-        name="floor",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.90, 0.91, 0.92],
-        rgb2=[0.84, 0.85, 0.87],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(name="floor", texrepeat=[10.0, 10.0], texuniform=True)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
-    plane = _add(
-        spec.worldbody, mujoco.mjtGeom.mjGEOM_PLANE, [0.5 * side, 0.5 * side, 1.0], [0] * 3
-    )
-    plane.material = "floor"
 
 
 def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:

@@ -1,8 +1,7 @@
 """`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: reports the results of runs.
 
-For one run it writes `mix.png`, `success.png`, `curves.png`, and `report.html`, which holds all
-figures. If the stages make a grid, it also writes `grid.png`. The run may still be going or may
-have been killed: the report leaves out a line that is not fully written. No JAX.
+For one run it writes its figures, and `report.html`, which holds all of them. The run may still be
+going or may have been killed: the report leaves out a line that is not fully written. No JAX.
 
 For several runs it prints a table: see `table`. With `out` it also writes the table there, as
 `report.html` and `report.json`.
@@ -21,6 +20,7 @@ from swarmjax.report import page as report_page
 from swarmjax.report import rows, table
 from swarmjax.report import send as report_send
 from swarmjax.report.config import ReportConfig
+from swarmjax.report.table import TableLine
 
 PAGE, TABLE = "report.html", "report.json"
 
@@ -56,27 +56,20 @@ def write(
     return written
 
 
-def write_table(
-    lines: Sequence[table.TableLine], out: Path, made_by: str, *, overwrite: bool = False
-) -> list[Path]:
-    """Writes the table of several runs.
-
-    Args:
-      lines: the lines of the table.
-      out: directory of the report; it is created.
-      made_by: the command that makes the table, for the page.
-      overwrite: whether files of other origin are replaced.
-
-    Returns:
-      The files.
-
-    Raises:
-      ConfigError: if `out` cannot be written.
-    """
-    page = report_page.table_page("Runs", made_by, lines)
-    found = json.dumps(table.plain(lines), indent=2) + "\n"
-    content = {TABLE: found.encode(), PAGE: page.encode()}
-    return builder.write(out, content, overwrite=overwrite)
+def _write_table(lines: Sequence[TableLine], made_by: str, settings: ReportConfig) -> Path:
+    """Writes the table of several runs; returns the path of its page."""
+    page = builder.render(
+        "report/runs.html",
+        styles=report_page.STYLES,
+        title="Runs",
+        command=made_by,
+        heads=table.HEADS,
+        rows=table.cells(lines),
+        note=table.note(lines),
+    )
+    text = json.dumps(table.plain(lines), indent=2) + "\n"
+    content = {TABLE: text.encode(), PAGE: page.encode()}
+    return builder.write(Path(settings.out or ""), content, overwrite=settings.overwrite)[-1]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -87,8 +80,8 @@ def main(arguments: Sequence[str]) -> int:
         lines = table.read(table.find(settings.runs))
         sys.stdout.write(f"{table.text(lines)}\n")
         if settings.out:
-            written = write_table(lines, Path(settings.out), made_by, overwrite=settings.overwrite)
-            sys.stdout.write(f"{written[-1]}: the same table as a page.\n")
+            page = _write_table(lines, made_by, settings)
+            sys.stdout.write(f"{page}: the same table as a page.\n")
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"

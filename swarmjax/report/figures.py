@@ -1,18 +1,17 @@
 """Draws the figures of a report with Matplotlib.
 
-The colour maps cividis and viridis rise evenly in lightness, so shares can also be read without
-colours (Crameri et al. 2020, "The misuse of colour in science communication").
+The colour map viridis rises evenly in lightness, so stages can also be told apart without colours
+(Crameri et al. 2020, "The misuse of colour in science communication").
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Normalize
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -20,11 +19,9 @@ from matplotlib.ticker import MaxNLocator
 from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
-from swarmjax.task.stage_config import StageConfig
 
 _POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
 _NAMED = 24  # stages named along a colour strip; more names would overlap
-SMALL = (5.4, 3.2)  # inches
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _STEPS = "arena control steps per seed"
 _CURVES = {
@@ -35,18 +32,16 @@ _CURVES = {
     "value_loss": "value loss",
 }
 
-type Cell = tuple[int, int, tuple[float, float]]  # robots, obstacles, side
-
 
 def draw(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, `curves` if the run recorded them, and `grid` if the
-      stages make one. The same run gives the same files, byte for byte.
+      PNG files by name: `mix`, `success`, and `curves` if the run recorded them. The same run
+      gives the same files, since they do not hold Matplotlib's version.
     """
     files = {}
-    makers = {"mix": mix, "success": success, "curves": curves, "grid": grid}
+    makers = {"mix": mix, "success": success, "curves": curves}
     for name, make in makers.items():
         figure = make(history)
         if figure is not None:
@@ -54,53 +49,12 @@ def draw(history: History) -> dict[str, bytes]:
     return files
 
 
-def by_stage(history: History) -> dict[str, Figure]:
-    """Draws each stage's newest verdict over time, one colour per stage, small enough for a phone.
-
-    A line is the interquartile mean over seeds, drawn where every seed has a value. It is dotted
-    where the stage is no longer trained on.
-
-    Returns:
-      One figure each for `targets`, `contacts` and `return`.
-    """
-    measures = {
-        "targets": (report_rows.measure(history), history.success),
-        "contacts": ("contacts per robot", history.by_stage["contacts_by_stage"]),
-        "return": ("return per robot", history.by_stage["return_by_stage"]),
-    }
-    return {key: _of_stages(history, *each) for key, each in measures.items()}
-
-
-def _of_stages(history: History, title: str, values: np.ndarray) -> Figure:
-    """Draws values [N, T, S] of all stages into one panel."""
-    at = _at(len(history.updates), _POINTS)
-    steps = history.arena_steps[at]
-    lately = report_rows.trained_lately(history)[:, at].any(axis=0)
-    mean = report_rows.together(values)[at]
-    figure = Figure(figsize=SMALL, layout="constrained")
-    axes = figure.subplots()
-    for i, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, len(history.names)))):
-        _curve(axes, steps, mean[:, i], lately[:, i], color=colour, lw=1.6)
-    axes.set(xlim=(0, steps[-1]), xlabel=_STEPS)
-    axes.set_title(title, loc="left", fontsize=10, pad=3)
-    axes.grid(visible=True, alpha=0.25)
-    axes.xaxis.set_major_formatter(drawing.thousands())
-    if values is history.success:
-        axes.set_ylim(0, 1.02)
-        axes.yaxis.set_major_formatter(drawing.percent())
-    if np.isnan(mean).all():
-        axes.text(0.5, 0.5, "not measured yet", transform=axes.transAxes, ha="center")
-    if len(history.names) > 1:
-        _name_colours(figure, axes, history.names)
-    return figure
-
-
-def mix(history: History, size: tuple[float, float] = (drawing.WIDTH, 4.2)) -> Figure:
-    """Draws each stage's share of the arenas, stacked, as the mean over seeds; `size` in inches."""
+def mix(history: History) -> Figure:
+    """Draws each stage's share of the arenas, stacked, as the mean over seeds."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     names = history.names
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(drawing.WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
     # The mix of an update holds from the end of the update before it.
     axes.stackplot(
@@ -159,9 +113,7 @@ def curves(history: History) -> Figure | None:
         for seed in seeds:
             panel.plot(steps, seed, color=_SEED, lw=0.7)
         panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
-        panel.set_title(title, loc="left", fontsize=10, pad=3)
-        panel.grid(visible=True, alpha=0.25)
-        panel.tick_params(labelsize=9)
+        drawing.dress(panel, title)
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
     panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
@@ -171,55 +123,6 @@ def curves(history: History) -> Figure | None:
     figure.supxlabel(_STEPS, fontsize=10)
     drawing.explain(figure, _seed_lines(history), 2)
     return figure
-
-
-def grid(history: History) -> Figure | None:
-    """Draws the last success of each cell, robots by side, one panel per number of obstacles.
-
-    Returns None if the stages of the run make no grid.
-    """
-    cells = cells_of(history.config.stage)
-    if cells is None:
-        return None
-    last, _ = report_rows.among(history.success[:, -1])
-    robots, obstacles, sides = (sorted(set(axis)) for axis in zip(*cells, strict=True))
-    columns = min(len(obstacles), 4)
-    rows = math.ceil(len(obstacles) / columns)
-    wide = 0.55 if all(low == high for low, high in sides) else 0.85
-    size = (1.6 + columns * (0.4 + wide * len(sides)), 0.9 + rows * (0.5 + 0.55 * len(robots)))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for panel, count in zip(panels, obstacles, strict=False):
-        table = np.full((len(robots), len(sides)), -1)
-        for (r, o, side), stage in cells.items():
-            if o == count:
-                table[robots.index(r), sides.index(side)] = stage
-        _heat(panel, table, last)
-        panel.set_title(f"{count} obstacle{'s' * (count != 1)}", fontsize=10)
-        panel.set_xticks(range(len(sides)), [report_rows.side_text(side) for side in sides])
-        panel.set_yticks(range(len(robots)), [str(r) for r in robots])
-    for panel in panels[len(obstacles) :]:
-        panel.set_visible(False)
-    figure.supxlabel("side of the arena (m)", fontsize=10)
-    figure.supylabel("robots", fontsize=10)
-    scale = ScalarMappable(Normalize(0.0, 1.0), "cividis")
-    bar = figure.colorbar(scale, ax=panels, format=drawing.percent())
-    bar.set_label(f"{report_rows.measure(history)}, at last")
-    return figure
-
-
-def cells_of(stages: tuple[StageConfig, ...]) -> Mapping[Cell, int] | None:
-    """Finds the stage of each cell robots x obstacles x side; None if the stages make no grid.
-
-    The stages make a grid if no two share a cell, at least two axes have several values, and at
-    least half of all cells are there. A grid may lack cells whose arena is too small for the
-    robots and obstacles.
-    """
-    cells = {(stage.robots, stage.obstacles, stage.sides): i for i, stage in enumerate(stages)}
-    lengths = [len(set(axis)) for axis in zip(*cells, strict=True)]
-    several = sum(length > 1 for length in lengths)
-    whole = len(cells) == len(stages) and 2 * len(cells) >= math.prod(lengths)
-    return cells if whole and several > 1 else None
 
 
 def _at(updates: int, points: int) -> np.ndarray:
@@ -262,17 +165,13 @@ def _curve(
 
 def _mark(panel: Axes, history: History, stage: int) -> None:
     """Writes a panel's name and last share, and draws the share that promotes."""
-    small = len(history.names) > report_rows.MANY
     last, measured = report_rows.among(history.success[:, -1])
-    figure = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
-    panel.set_title(
-        f"{history.names[stage]}   {figure}", loc="left", fontsize=7 if small else 10, pad=3
-    )
+    share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
+    small = len(history.names) > report_rows.MANY
+    drawing.dress(panel, f"{history.names[stage]}   {share}", 7 if small else 10)
     promoting = _promoting(history)
     if promoting is not None:
         panel.axhline(promoting, color=_LIMIT, lw=0.8, ls="--")
-    panel.grid(visible=True, alpha=0.25)
-    panel.tick_params(labelsize=7 if small else 9)
 
 
 def _explain_lines(figure: Figure, history: History) -> None:
@@ -310,17 +209,3 @@ def _label_outer(figure: Figure, history: History) -> None:
     panel.yaxis.set_major_formatter(drawing.percent())
     figure.supxlabel(_STEPS, fontsize=10)
     figure.supylabel(report_rows.measure(history), fontsize=10)
-
-
-def _heat(panel: Axes, table: np.ndarray, last: np.ndarray) -> None:
-    """Draws a table of stage indices as coloured cells with their numbers; -1 is an empty cell."""
-    values = np.where(table < 0, np.nan, last[table])
-    panel.set_facecolor("0.93")
-    panel.imshow(values, "cividis", Normalize(0.0, 1.0), aspect="auto", origin="lower")
-    for (row, column), stage in np.ndenumerate(table):
-        value = values[row, column]
-        if stage < 0 or np.isnan(value):
-            text, colour = ("" if stage < 0 else "-"), "black"
-        else:
-            text, colour = f"{100 * value:.0f}", "white" if value < 0.55 else "black"
-        panel.text(column, row, text, color=colour, ha="center", va="center", fontsize=9)

@@ -9,24 +9,10 @@ from swarmjax import words
 from swarmjax.config import to_dict
 from swarmjax.pages import builder
 from swarmjax.report import rows as report_rows
-from swarmjax.report import table as report_table
 from swarmjax.report.rows import History, Row
-from swarmjax.report.table import TableLine
 
 GOOD = 0.9  # success at which a stage counts as learned
 STYLES = (builder.STYLE, "report/report.css")
-_TOP = 5  # stages named per reweighing
-
-_CAPTIONS = {
-    "mix": "Share of the arenas on each stage.",
-    "success": "Success of each stage, over a whole cohort: all episodes that began within one "
-    "step limit. The number above each panel is the last one. The thick line is drawn where every "
-    "seed has a value.",
-    "curves": "Learning curves over updates. Return and contacts are sums over an episode, and "
-    "means over the robots of the episodes that ended in the update. Short episodes end first, so "
-    "the first values mean little. The entropy of the policy's actions is in nats.",
-    "grid": "Last success of each cell, in percent. Grey cells are not stages of this run.",
-}
 
 
 def page(title: str, command: str, history: History, figures: Mapping[str, bytes]) -> str:
@@ -36,7 +22,7 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
       title: names the run.
       command: the command that makes the report.
       history: the run's history.
-      figures: PNG files by the names of `_CAPTIONS`.
+      figures: PNG files by the names of the captions in `report.html`.
 
     Returns:
       HTML with every name from the run escaped.
@@ -49,32 +35,8 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
         about=facts(history),
         is_wide=len(history.names) > report_rows.MANY,
         figures=figures,
-        captions=_CAPTIONS,
         decisions=_decisions(history),
-        reweighings=_reweighings(history),
         stages=_stages(history),
-    )
-
-
-def table_page(title: str, command: str, lines: Sequence[TableLine]) -> str:
-    """Lays out the table of several runs.
-
-    Args:
-      title: title of the page.
-      command: the command that makes the report.
-      lines: the lines of the table.
-
-    Returns:
-      HTML with every name from the runs escaped.
-    """
-    return builder.render(
-        "report/runs.html",
-        styles=STYLES,
-        title=title,
-        command=command,
-        heads=report_table.HEADS,
-        rows=report_table.cells(lines),
-        note=report_table.note(lines),
     )
 
 
@@ -185,21 +147,6 @@ def _decisions(history: History) -> list[tuple]:
         for row in history.decisions
         if "weights" not in row
     ]
-
-
-def _reweighings(history: History) -> list[tuple]:
-    """Makes the table of each seed's reweighings: how many, and the last weights."""
-    by_seed: dict[int, list[Row]] = {}
-    for row in history.decisions:
-        if "weights" in row:
-            by_seed.setdefault(row["seed"], []).append(row)
-    rows = []
-    for seed, found in by_seed.items():
-        weights = {name: share or 0.0 for name, share in found[-1]["weights"].items()}
-        top = sorted(weights, key=lambda name: -weights[name])[:_TOP]
-        most = ", ".join(f"{name} {_percent(weights[name])}" for name in top)
-        rows.append((seed, len(found), f"{found[-1]['update'] + 1:,}", most))
-    return rows
 
 
 def _stages(history: History) -> list[tuple]:

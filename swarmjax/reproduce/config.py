@@ -5,11 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about, build, files, show, to_dict
+from swarmjax.config import ConfigError, Section, about, files, show
 from swarmjax.config.section import MAX_COUNT, build_stored
-
-_REPRODUCE_RESUME_KEYS = ("resume", "minutes", "device", "arms", "episodes", "workers")
-
+from swarmjax.evaluate.statistics import LEAST_DRAWN
 
 # docs/paper.md describes the runs of a reproduction.
 Arm = Literal[
@@ -20,61 +18,30 @@ Arm = Literal[
     "modern_curriculum",
     "modern_baseline",
 ]
-
-
 ARMS: tuple[Arm, ...] = typing.get_args(Arm)
-
-
-LEAST_SEEDS = 3  # for an interval
+UPDATE = 6000  # control steps of an update of `algo=paper`; a shorter budget trains nothing
+_RESUME_KEYS = ("resume", "minutes", "arms", "episodes", "workers")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReproduceConfig(Section):
-    """Settings to repeat the published experiment with several seeds.
-
-    All other settings are as in `algo=paper`.
-    """
+    """Settings to repeat the published experiment with several seeds, as in `algo=paper`."""
 
     command: ClassVar[str] = "reproduce"
 
-    seeds: int = field(default=10, metadata=about("seeds of each arm; at least 3", 1, 4096))
-    seed: int = field(default=0, metadata=about("the first seed", 0, MAX_COUNT))
-    seeds_by: Literal["vmap", "map", "cores"] = field(
-        default="cores", metadata=about("as in training")
+    seeds: int = field(
+        default=10, metadata=about("seeds of each arm; an interval needs three", LEAST_DRAWN, 4096)
     )
     budget: int = field(
         default=1_000_000,
-        metadata=about("control steps per seed: 'max training timesteps'", 1, MAX_COUNT),
+        metadata=about("control steps per seed: 'max training timesteps'", UPDATE, MAX_COUNT),
     )
     fine_tune: int = field(
-        default=250_000, metadata=about("control steps per seed in the 1.5 m arena", 1, MAX_COUNT)
+        default=250_000,
+        metadata=about("control steps per seed in the 1.5 m arena", UPDATE, MAX_COUNT),
     )
     arms: tuple[Arm, ...] = field(
         default=ARMS, metadata=about("arms to train; NAME_expanded continues arm NAME")
-    )
-    rollout_length: int = field(
-        default=6000, metadata=about("control steps per update of the paper's PPO", 1, MAX_COUNT)
-    )
-    epochs: int = field(
-        default=80, metadata=about("per update of the paper's PPO: 'PPO K epochs'", 1, MAX_COUNT)
-    )
-    step_limit: int = field(
-        default=1500, metadata=about("'Max timesteps per episode'", 1, MAX_COUNT)
-    )
-    time_out: Literal["terminal", "leak"] = field(
-        default="terminal", metadata=about("the paper's return at the step limit: algo.time_out")
-    )
-    threshold: float = field(
-        default=0.8, metadata=about("share of targets reached that promotes", 0.0, 1.0)
-    )
-    robot: Literal["paper", "planar"] = field(
-        default="paper", metadata=about("speed range: as printed, or of the hardware")
-    )
-    impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("physics implementation, as in sim.impl")
-    )
-    device: Literal["auto", "cpu", "gpu"] = field(
-        default="auto", metadata=about("device for training; auto: a GPU if there is one")
     )
     minutes: float | None = field(
         default=None,
@@ -94,16 +61,6 @@ class ReproduceConfig(Section):
     )
 
     def _check(self) -> None:
-        if self.seeds < LEAST_SEEDS:
-            raise ConfigError(
-                f"seeds is {self.seeds}, too few for an interval: give {LEAST_SEEDS} or more."
-            )
-        for key in ("budget", "fine_tune"):
-            if getattr(self, key) < self.rollout_length:
-                raise ConfigError(
-                    f"{key} is {getattr(self, key)}, which ends before the first update: give at "
-                    f"least {self.rollout_length}, the control steps of one update."
-                )
         if not self.arms:
             raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
         for arm in self.arms:
@@ -131,10 +88,9 @@ def load_reproduce(
         return files.load(ReproduceConfig, overrides)
     words = files.parse(ReproduceConfig, overrides)
     for key, value in words.items():
-        if key not in _REPRODUCE_RESUME_KEYS:
+        if key not in _RESUME_KEYS:
             raise ConfigError(
                 f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of "
-                f"the stored reproduction and takes {', '.join(_REPRODUCE_RESUME_KEYS)} only."
+                f"the stored reproduction and takes {', '.join(_RESUME_KEYS)} only."
             )
-    kept = to_dict(build_stored(ReproduceConfig, stored, "stored ")) | {"minutes": None}
-    return build(ReproduceConfig, kept | files.nest(words))
+    return build_stored(ReproduceConfig, {**stored, "minutes": None, **words}, "")

@@ -1,41 +1,50 @@
 """Tests whether a claim holds: is the interval of a value or a difference beyond a limit?"""
 
+import math
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from swarmjax.evaluate import statistics
-from swarmjax.evaluate.statistics import Interval, iqm
+from swarmjax.evaluate.statistics import iqm
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
+
+# A function of the values [N] of a reading's arms: whether the claim holds, and the numbers.
+type Criterion = Callable[..., tuple[bool | None, str]]
 
 ABOUT = 0.5  # "approximately": within this share of the number
 _ROUNDING = 1e-9  # rounding error of a mean: the mean of 0.95, 0.95 and 0.95 is less than 0.95
 
 
-def at_least(*values: np.ndarray, least: float) -> tuple[bool | None, str]:
-    """Tests whether all arms reach a share: their intervals lie at or above it.
+def within(
+    *values: np.ndarray, low: float, high: float = math.inf, unit: Unit = SHARE
+) -> tuple[bool | None, str]:
+    """Tests whether the intervals of all arms lie from `low` to `high`.
 
-    An interval below the share contradicts the claim.
+    An interval that is wholly outside contradicts the claim.
     """
-    found = [_mean(each) for each in values]
-    text = " and ".join(SHARE.interval(each) for each in found)
-    if all(each.low >= least - _ROUNDING for each in found):
+    low, high = low - _ROUNDING, high + _ROUNDING
+    means = [statistics.bootstrap(each[:, None], iqm) for each in values]
+    text = " and ".join(map(unit.interval, means))
+    if all(low <= mean.low and mean.high <= high for mean in means):
         return True, text
-    return (False if any(each.high < least - _ROUNDING for each in found) else None), text
+    return (False if any(mean.high < low or mean.low > high for mean in means) else None), text
 
 
-def below(values: np.ndarray, *, limit: float) -> tuple[bool | None, str]:
-    """Tests whether an arm's interval lies below a share; an interval at or above contradicts."""
-    found = _mean(values)
-    text = SHARE.interval(found)
-    return _side(limit - found.high, limit - found.low, text, touching=True)
+def about(number: float) -> Criterion:
+    """Tests whether a place is approximately this number."""
+    return partial(within, low=(1 - ABOUT) * number, high=(1 + ABOUT) * number, unit=PLACE)
 
 
-def about(values: np.ndarray, *, number: float) -> tuple[bool | None, str]:
-    """Tests whether an arm's interval lies within `ABOUT` of a number; outside it contradicts."""
-    found, low, high = _mean(values), (1 - ABOUT) * number, (1 + ABOUT) * number
-    text = PLACE.interval(found)
-    if low <= found.low and found.high <= high:
-        return True, text
-    return (False if found.high < low or found.low > high else None), text
+def opposite(criterion: Criterion) -> Criterion:
+    """Holds where a criterion is contradicted, and is contradicted where it holds."""
+
+    def test(*values: np.ndarray) -> tuple[bool | None, str]:
+        holds, text = criterion(*values)
+        return None if holds is None else not holds, text
+
+    return test
 
 
 def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
@@ -44,15 +53,8 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
     An interval below 0 contradicts the claim.
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
-    both = f"{unit.value(float(iqm(ours)))} against {unit.value(float(iqm(theirs)))}"
-    text = f"{both}, difference {unit.difference(more)}"
-    return _side(more.low, more.high, text)
-
-
-def lower(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
-    """Tests whether the first arm has less, as `higher` does."""
-    holds, text = higher(ours, theirs, unit=unit)
-    return (None if holds is None else not holds), text
+    both = " against ".join(unit.value(float(iqm(each))) for each in (ours, theirs))
+    return _sign(more.low, more.high), f"{both}, difference {unit.difference(more)}"
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
@@ -65,13 +67,7 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
     text = f"{both}, probability of being earlier {NUMBER.interval(chance)}"
-    return _side(chance.low - 0.5, chance.high - 0.5, text)
-
-
-def above_zero(values: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the interval of a share lies above 0; a share of 0 contradicts the claim."""
-    found = _mean(values)
-    return _side(found.low, found.high, SHARE.interval(found), touching=True)
+    return _sign(chance.low - 0.5, chance.high - 0.5), text
 
 
 def crowded(values: np.ndarray) -> tuple[bool | None, str]:
@@ -79,21 +75,13 @@ def crowded(values: np.ndarray) -> tuple[bool | None, str]:
 
     If it senses more, crowding is possible but not proven, so the reading stays open.
     """
-    found = _mean(values)
-    text = f"{NUMBER.difference(found)} steps"
-    if found.high <= _ROUNDING:
+    mean = statistics.bootstrap(values[:, None], iqm)
+    text = f"{NUMBER.difference(mean)} steps"
+    if mean.high <= _ROUNDING:
         return False, text
     return None, f"{text}, which crowding would cause, but other things would too"
 
 
-def _mean(values: np.ndarray) -> Interval[float]:
-    """Takes the interquartile mean over seeds [N], with its interval."""
-    return statistics.bootstrap(values[:, None], iqm)
-
-
-def _side(low: float, high: float, text: str, *, touching: bool = False) -> tuple[bool | None, str]:
-    """Tells whether an interval lies above 0, below 0 (or at 0, if `touching`), or straddles 0."""
-    if low > _ROUNDING:
-        return True, text
-    beyond = _ROUNDING if touching else -_ROUNDING
-    return (False if high < beyond else None), text
+def _sign(low: float, high: float) -> bool | None:
+    """Tells whether an interval lies above 0 (True), below 0 (False), or touches 0 (None)."""
+    return True if low > _ROUNDING else False if high < -_ROUNDING else None

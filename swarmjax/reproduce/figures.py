@@ -10,8 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from swarmjax.evaluate import statistics
@@ -19,8 +21,7 @@ from swarmjax.evaluate.statistics import curve, iqm
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
-from swarmjax.reproduce.raster import raster
-from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
+from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
 SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
 _POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
@@ -33,6 +34,19 @@ COLOURS = {
     "modern_baseline": "#aa4499",
 }
 _DASHES = {"baseline": "--", "baseline_expanded": "--", "modern_baseline": "--"}
+_LABELS: dict[Measure, str] = {
+    measures.targets: "targets reached",
+    measures.first_reward: "reward of robot 1 (m)",
+    measures.mean_reward: "reward of a robot (m)",
+    measures.sensed_share: "steps within infrared range",
+    measures.contacts: "contacts per robot",
+}
+_SHARES = (measures.targets, measures.sensed_share)  # shown in percent
+
+PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
+_COLUMNS = 700  # columns of a raster: about one per pixel
+_REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
+_NOTHING, _STEADY = "0.86", "#e69f00"
 
 
 class Plot(NamedTuple):
@@ -43,12 +57,16 @@ class Plot(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """A row of curves: a measure over the episodes of one or all stages; shares in percent."""
+    """A row of curves: a measure over the episodes of one stage, or of all (None)."""
 
-    label: str
     of: Measure
-    stage: str | None
-    share: bool = False
+    stage: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The label of its vertical axis."""
+        which = "all episodes" if self.stage is None else f"episodes on {self.stage}"
+        return f"{_LABELS[self.of]},\n{which}"
 
 
 def draw(data: Reproduction) -> dict[str, bytes]:
@@ -66,7 +84,11 @@ def draw(data: Reproduction) -> dict[str, bytes]:
 
 
 def curves(
-    data: Reproduction, arms: tuple[str, ...], *, panels: tuple[Panel, ...], axes: tuple[Axis, ...]
+    data: Reproduction,
+    arms: tuple[str, ...],
+    *,
+    panels: tuple[Panel, ...],
+    axes: tuple[Axis, ...] = ("episode", "steps"),
 ) -> Figure:
     """Draws rolling means: every seed, and their interquartile mean with its interval.
 
@@ -86,7 +108,7 @@ def curves(
             place.grid(visible=True, alpha=0.25)
             place.tick_params(labelsize=8)
         row[0].set_ylabel(panel.label, fontsize=8)
-        if panel.share:
+        if panel.of in _SHARES:
             row[0].yaxis.set_major_formatter(drawing.percent())
     for place, axis in zip(grid[-1], axes, strict=True):
         place.set_xlabel(AXES[axis], fontsize=9)
@@ -99,25 +121,21 @@ def curves(
 
 def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) -> None:
     """Draws the rolling means of an arm."""
-    found = []
+    seeds = []
     for log in data.logs[arm]:
         chosen = log.on(panel.stage)
         at = measures.along(chosen, axis)[WINDOW - 1 :]
-        found.append((at, measures.rolling(np.asarray(panel.of(chosen), float))))
-        place.plot(*_thinned(*found[-1]), color=COLOURS[arm], lw=0.5, alpha=0.35)
-    shared = measures.on_grid(found, _POINTS)
+        means = measures.rolling(np.asarray(panel.of(chosen), float))
+        seeds.append((at, means))
+        every = max(1, len(at) // 500)  # about one point per pixel
+        place.plot(at[::every], means[::every], color=COLOURS[arm], lw=0.5, alpha=0.35)
+    shared = measures.on_grid(seeds, _POINTS)
     if shared is None:
         return
     band = curve(shared[1], resamples=_RESAMPLES)
     place.fill_between(shared[0], band.low, band.high, color=COLOURS[arm], alpha=0.25, lw=0)
     style = _DASHES.get(arm, "-")
     place.plot(shared[0], band.estimate, style, color=COLOURS[arm], lw=2.0)
-
-
-def _thinned(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thins a curve to about one point per pixel."""
-    every = max(1, len(at) // 500)
-    return at[::every], values[::every]
 
 
 def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -> None:
@@ -170,45 +188,111 @@ def _dots(place: Axes, values: np.ndarray, row: float, style: tuple[str, str]) -
     place.plot([mean.estimate], [row], mark, color=colour, ms=5)
 
 
-_TWO: tuple[Axis, ...] = ("episode", "steps")
-_ALL_OF_THEM = "all episodes"
-_ON_LAST = f"episodes on {LAST}"
+def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str | None) -> Figure:
+    """Draws a line for each episode that reached the goal, one row per seed: Figures 6 and 9.
+
+    Args:
+      data: the reproduction's data.
+      arms: finished arms; each gets two panels, one per reading of success.
+      axis: unit of the horizontal axis.
+      stage: shows only the episodes of this stage; None for all.
+    """
+    kinds = [(name, success, arm) for name, success in measures.SUCCESS.items() for arm in arms]
+    seeds = len(data.seeds)
+    height = 1.1 + len(kinds) * (0.55 + 0.11 * seeds)
+    figure = Figure(figsize=(drawing.WIDTH, height), layout="constrained")
+    panels = figure.subplots(len(kinds), sharex=True, squeeze=False)[:, 0]
+    edges = _edges([log for arm in arms for log in data.logs[arm]], axis)
+    for panel, (name, success, arm) in zip(panels, kinds, strict=True):
+        rows = [columns(log, success, axis, stage, edges) for log in data.logs[arm]]
+        extent = (float(edges[0]), float(edges[-1]), seeds - 0.5, -0.5)
+        panel.set_facecolor(_NOTHING)
+        look = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
+        panel.imshow(np.array(rows), _REACHED, Normalize(0.0, 1.0), **look)
+        places = measures.steady_at(data, arm, success=success, axis=axis, stage=stage)
+        panel.scatter(places, range(seeds), s=16, marker="v", color=_STEADY, ec="black", lw=0.5)
+        if axis == "episode" and arm in PAPER:
+            panel.axvline(PAPER[arm], color="black", lw=1.0, ls=":")
+        panel.set_title(f"{arm}: {name}", loc="left", fontsize=9, pad=3)
+        panel.set_yticks(range(seeds), [str(seed) for seed in data.seeds], fontsize=6)
+    panels[-1].set_xlabel(AXES[axis])
+    panels[-1].xaxis.set_major_formatter(drawing.thousands(least=10_000))
+    figure.supylabel("seed", fontsize=10)
+    _explain_raster(figure, axis == "episode" and any(arm in PAPER for arm in arms))
+    return figure
 
 
-def _rewards(of: Measure, who: str) -> tuple[Panel, ...]:
-    kinds = {_ALL_OF_THEM: None, _ON_LAST: LAST}
-    return tuple(Panel(f"reward of {who} (m),\n{which}", of, kinds[which]) for which in kinds)
+def columns(
+    log: RunLog, success: Measure, axis: Axis, stage: str | None, edges: np.ndarray
+) -> np.ndarray:
+    """Computes the share of successes in each column of a raster.
+
+    A column in which no episode ended shows the episode that was running.
+
+    Args:
+      log: log of one seed.
+      success: takes [E] successes from a log.
+      axis: unit of the horizontal axis.
+      stage: shows only the episodes of this stage; None for all.
+      edges: [P + 1] edges of the columns, increasing.
+
+    Returns:
+      [P] values from 0 to 1; nan where there is no episode to show.
+    """
+    at, shown = measures.along(log, axis), np.ones(len(log), bool)
+    if stage is not None:
+        shown = log.stage == stage
+    value = np.where(shown, success(log), np.nan)
+    count = len(edges) - 1
+    column = np.clip(np.searchsorted(edges, at, side="left") - 1, 0, count - 1)
+    shows = np.bincount(column[shown], minlength=count)
+    wins = np.bincount(column[shown], weights=value[shown], minlength=count)
+    ended = np.bincount(column, minlength=count) > 0
+    following = np.searchsorted(at, edges[1:], side="left")
+    under_way = np.append(value, np.nan)[following]
+    share = np.where(shows > 0, wins / np.maximum(shows, 1), np.nan)
+    return np.where(ended, share, under_way)
 
 
-def _collisions(stage: str | None, which: str) -> tuple[Panel, ...]:
-    return (
-        Panel(f"steps within infrared range,\n{which}", measures.sensed_share, stage, share=True),
-        Panel(f"contacts per robot,\n{which}", measures.contacts, stage),
-    )
+def _edges(logs: list[RunLog], axis: Axis) -> np.ndarray:
+    """Computes the column edges of a raster: one column per episode unless there are too many."""
+    last = max(int(measures.along(log, axis)[-1]) for log in logs)
+    if axis == "episode":
+        return np.linspace(0, last, min(last, _COLUMNS) + 1) + 0.5
+    return np.linspace(0, last, _COLUMNS + 1)
 
 
-_OF_ROBOT_1 = _rewards(measures.first_reward, "robot 1")
-_OF_SWARM = _rewards(measures.mean_reward, "a robot")
-_TO_THE_END = (
-    Panel("targets reached", measures.targets, EXPANDED, share=True),
-    Panel("reward of a robot (m)", measures.mean_reward, EXPANDED),
-)
-_DEFAULT_TRAINER = (
-    Panel(f"targets reached,\n{_ON_LAST}", measures.targets, LAST, share=True),
-    _OF_SWARM[1],
-    *_collisions(LAST, _ON_LAST),
-)
-_ALL_COLLISIONS = (*_collisions(None, _ALL_OF_THEM), *_collisions(LAST, _ON_LAST))
+def _explain_raster(figure: Figure, paper: bool) -> None:
+    """Adds a legend above the panels."""
+    kinds = [
+        Patch(fc=_REACHED(1.0), label="reached"),
+        Patch(fc="white", ec="0.5", lw=0.5, label="not reached"),
+        Patch(fc=_NOTHING, label="no such episode"),
+        Line2D([], [], color=_STEADY, mec="black", mew=0.5, marker="v", ls="", label="steady from"),
+    ]
+    if paper:
+        kinds.append(Line2D([], [], color="black", lw=1.0, ls=":", label="the paper's number"))
+    drawing.explain(figure, kinds)
+
+
+def _collisions(stage: str | None) -> tuple[Panel, ...]:
+    return Panel(measures.sensed_share, stage), Panel(measures.contacts, stage)
+
+
+_ROBOT_1 = (Panel(measures.first_reward), Panel(measures.first_reward, LAST))
+_SWARM = (Panel(measures.mean_reward), Panel(measures.mean_reward, LAST))
+_TO_THE_END = (Panel(measures.targets, EXPANDED), Panel(measures.mean_reward, EXPANDED))
+_DEFAULT_TRAINER = (Panel(measures.targets, LAST), _SWARM[1], *_collisions(LAST))
 
 # Their captions are in reproduce.html.
 PLOTS = {
     "figure6_episodes": Plot(PAIR, partial(raster, axis="episode", stage=None)),
     "figure6_steps": Plot(PAIR, partial(raster, axis="steps", stage=LAST)),
-    "figure7_robot1": Plot(PAIR, partial(curves, panels=_OF_ROBOT_1, axes=_TWO)),
-    "figure7_swarm": Plot(PAIR, partial(curves, panels=_OF_SWARM, axes=_TWO)),
-    "figure8": Plot(PAIR, partial(curves, panels=_ALL_COLLISIONS, axes=_TWO)),
+    "figure7_robot1": Plot(PAIR, partial(curves, panels=_ROBOT_1)),
+    "figure7_swarm": Plot(PAIR, partial(curves, panels=_SWARM)),
+    "figure8": Plot(PAIR, partial(curves, panels=_collisions(None) + _collisions(LAST))),
     "figure9_raster": Plot(TUNED, partial(raster, axis="episode", stage=EXPANDED)),
-    "figure9_curves": Plot(TUNED, partial(curves, panels=_TO_THE_END, axes=_TWO)),
+    "figure9_curves": Plot(TUNED, partial(curves, panels=_TO_THE_END)),
     "final": Plot((*PAIR, *TUNED, *MODERN), final),
     "modern_curves": Plot(
         (*PAIR, *MODERN), partial(curves, panels=_DEFAULT_TRAINER, axes=("steps",))

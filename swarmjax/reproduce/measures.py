@@ -6,8 +6,7 @@ Axes as in `rows`. No JAX.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -135,12 +134,12 @@ def steady_at(
     Returns:
       [N] episode numbers or arena steps; inf for a seed that never becomes steady.
     """
-    found = []
+    places = []
     for log in data.logs[arm]:
         chosen = log.on(stage)
         at = steady(success(chosen))
-        found.append(math.inf if at is None else float(along(chosen, axis)[at]))
-    return np.array(found)
+        places.append(math.inf if at is None else float(along(chosen, axis)[at]))
+    return np.array(places)
 
 
 def late(data: Reproduction, arm: str, *, of: Measure, stage: str) -> np.ndarray:
@@ -177,7 +176,7 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     Returns:
       [N] robot steps per pair, mean by seed; nan for a seed without such an episode.
     """
-    found = []
+    differences = []
     for log in data.logs[arm]:
         chosen = log.on(stage)
         chosen = chosen.where(np.arange(len(chosen)) >= len(chosen) - WINDOW)
@@ -186,8 +185,8 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
         first = np.where(chosen.reached, chosen.robot_steps, np.inf).argmin(axis=1)
         last = np.where(chosen.reached, chosen.robot_steps, -np.inf).argmax(axis=1)
         more = chosen.sensed[rows, last] - chosen.sensed[rows, first]
-        found.append(more.mean() if len(more) else np.nan)
-    return np.array(found)
+        differences.append(more.mean() if len(more) else np.nan)
+    return np.array(differences)
 
 
 def reward_reached(
@@ -208,12 +207,12 @@ def reward_reached(
     """
     means = {rival: [rolling(of(log.on(stage))) for log in data.logs[rival]] for rival in rivals}
     best = max((m.max() for ms in means.values() for m in ms if len(m)), default=np.inf)
-    found = []
+    places = []
     for log, mean in zip(data.logs[arm], means[arm], strict=True):
         there = np.flatnonzero(mean >= 0.9 * best)
         at = along(log.on(stage), axis)[WINDOW - 1 :]
-        found.append(float(at[there[0]]) if len(there) and best > 0 else math.inf)
-    return np.array(found)
+        places.append(float(at[there[0]]) if len(there) and best > 0 else math.inf)
+    return np.array(places)
 
 
 def on_grid(
@@ -238,8 +237,7 @@ def on_grid(
     return grid, np.array(taken)
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(NamedTuple):
     """Writes values of a unit.
 
     Attributes:
@@ -256,14 +254,13 @@ class Unit:
         """Writes a value."""
         return f"{self.number(value)}{self.suffix}"
 
-    def interval(self, found: Interval[float]) -> str:
+    def interval(self, of: Interval[float]) -> str:
         """Writes an estimate with its interval in brackets."""
-        low, high = self.number(found.low), self.number(found.high)
-        return f"{self.value(found.estimate)} ({low} to {high})"
+        return f"{self.value(of.estimate)} ({self.number(of.low)} to {self.number(of.high)})"
 
-    def difference(self, found: Interval[float]) -> str:
+    def difference(self, of: Interval[float]) -> str:
         """Writes a difference with its interval, each number with its sign."""
-        estimate, low, high = map(self._signed, found)
+        estimate, low, high = map(self._signed, of)
         return f"{estimate}{self.apart} ({low} to {high})"
 
     def _signed(self, value: float) -> str:
@@ -274,18 +271,7 @@ class Unit:
         return ("+" if value > 0 else "\N{MINUS SIGN}") + plain
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f}"
-
-
-def _place(place: float) -> str:
-    return "never" if math.isinf(place) else f"{place:,.0f}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"
-
-
-SHARE = Unit(_percent, " %", " points")
-PLACE = Unit(_place)  # an episode number or arena steps; inf means never
-NUMBER = Unit(_number)
+SHARE = Unit(lambda share: f"{100 * share:.1f}", " %", " points")
+# An episode number or arena steps; inf means never.
+PLACE = Unit(lambda place: "never" if math.isinf(place) else f"{place:,.0f}")
+NUMBER = Unit(lambda value: f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}")

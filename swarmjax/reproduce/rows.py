@@ -8,27 +8,20 @@ an episode log, a seed or its evaluation, an error names the file and the arm.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from swarmjax.config import ConfigError
-from swarmjax.evaluate.statistics import LEAST_DRAWN
+from swarmjax.config import ConfigError, build
 from swarmjax.report import rows as report_rows
-from swarmjax.report.rows import Row, ValueKind
+from swarmjax.report.rows import Row
+from swarmjax.reproduce.config import ARMS, ReproduceConfig
+from swarmjax.run.directory import SUMMARY
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
-FORMAT = 2  # of both files
+FORMAT = 3  # of both files
+_LAST_READER = "d8b3078"  # the last commit that reads format 2
 LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
-ARMS = {
-    "curriculum": "the paper's algorithm with its curriculum",
-    "baseline": "the paper's algorithm on the last stage from scratch",
-    "curriculum_expanded": "curriculum, trained on at 1.5 m",
-    "baseline_expanded": "baseline, trained on at 1.5 m",
-    "modern_curriculum": "the default trainer with the paper's curriculum",
-    "modern_baseline": "the default trainer on the last stage from scratch",
-}
 PAIR = ("curriculum", "baseline")
 TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
@@ -40,11 +33,6 @@ _BY_ROBOT = {
     "reward": report_rows.NUMBER,
     **dict.fromkeys(("robot_steps", "sensed", "contacts"), report_rows.COUNT),
 }
-_SEEDS = ValueKind(
-    "list of whole numbers",
-    lambda value: isinstance(value, list) and all(map(report_rows.COUNT.fits, value)),
-)
-_MAPS = ("settings", "versions", "device", "commit", "seconds", "compile_s")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,16 +81,23 @@ class Reproduction:
     """The results of a reproduction.
 
     Attributes:
-      facts: contents of `reproduce.json`.
-      seeds: [N], increasing.
+      settings: its settings.
+      versions: versions of the software that computed it, by name.
+      summaries: `summary.json` of each finished arm.
       logs: N logs of each finished arm.
       judged: [N] values by finished arm and stage, for each name in `JUDGED`.
     """
 
-    facts: Row
-    seeds: tuple[int, ...]
+    settings: ReproduceConfig
+    versions: Row
+    summaries: dict[str, Row]
     logs: dict[str, tuple[RunLog, ...]]
     judged: dict[tuple[str, str], dict[str, np.ndarray]]
+
+    @property
+    def seeds(self) -> range:
+        """The seeds [N]."""
+        return range(self.settings.seeds)
 
     def lacking(self, arms: Sequence[str]) -> list[str]:
         """Lists which of the given arms have not finished."""
@@ -115,75 +110,100 @@ def read(out: Path) -> Reproduction:
     Raises:
       ConfigError: if a file, a finished arm, a seed or an evaluation is missing or damaged.
     """
-    facts = _read_facts(out)
-    seeds = tuple(sorted(facts["seeds"]))
-    finished = [arm for arm in ARMS if arm in facts["seconds"]]
+    facts = read_facts(out)
+    settings = build(ReproduceConfig, facts["settings"], f"{out / FACTS}: settings.")
+    finished = summaries(out)
     if not finished:
-        raise ConfigError(f"{out / FACTS} names no finished arm: continue the reproduction.")
+        raise ConfigError(f"{out} holds no finished arm: continue the reproduction.")
     return Reproduction(
-        facts=facts,
-        seeds=seeds,
-        logs={arm: _read_logs(out / arm, seeds) for arm in finished},
-        judged=_read_judged(out, finished, seeds),
+        settings=settings,
+        versions=facts["versions"],
+        summaries=finished,
+        logs={arm: _read_logs(out / arm, range(settings.seeds)) for arm in finished},
+        judged=_read_judged(out, list(finished), range(settings.seeds)),
     )
 
 
-def _read_facts(out: Path) -> Row:
-    """Reads `reproduce.json`, the facts of the reproduction."""
-    path = out / FACTS
-    if not path.exists():
+def read_facts(out: Path) -> Row:
+    """Reads `reproduce.json`: the settings of the reproduction, and versions of software.
+
+    Raises:
+      ConfigError: if the file is missing or damaged, or has another format.
+    """
+    if not (out / FACTS).exists():
         raise ConfigError(f"{out} is not a reproduction: it has no {FACTS}.")
-    facts = report_rows.read_object(path)
-    _check_format(facts, path)
-    report_rows.check(facts, ("budget", "fine_tune"), report_rows.WHOLE, str(path))
-    report_rows.check(facts, ("seeds",), _SEEDS, str(path))
-    seeds = facts["seeds"]
-    if len(set(seeds)) < LEAST_DRAWN:
-        raise ConfigError(
-            f"{path} has {len(set(seeds))} seeds: an interval needs {LEAST_DRAWN} or more."
-        )
-    report_rows.check(facts, _MAPS, report_rows.MAP, str(path))
-    for key in ("seconds", "compile_s"):
-        number = report_rows.NUMBER_OR_NULL
-        report_rows.check(facts[key], facts[key], number, f"{path}, {key},")
+    facts = _read_object(out / FACTS)
+    report_rows.check(facts, ("settings", "versions"), report_rows.MAP, str(out / FACTS))
     return facts
 
 
-def _check_format(found: Row, path: Path) -> None:
-    if found.get("format") != FORMAT:
+def summaries(out: Path) -> dict[str, Row]:
+    """Reads the summaries of the arms that are done.
+
+    Args:
+      out: directory of the reproduction.
+
+    Returns:
+      The `summary.json` of each arm, in the order of `ARMS`.
+
+    Raises:
+      ConfigError: if a file is damaged.
+    """
+    paths = {arm: out / arm / SUMMARY for arm in ARMS}
+    every = {arm: report_rows.read_object(path) for arm, path in paths.items() if path.exists()}
+    finished = {arm: summary for arm, summary in every.items() if summary.get("budget_spent")}
+    for arm, summary in finished.items():
+        times = ("train_s", "compile_s")
+        report_rows.check(summary, times, report_rows.NUMBER_OR_NULL, str(paths[arm]))
+    return finished
+
+
+def read_rows(out: Path) -> list[Row]:
+    """Reads `evaluation.json`: a row for each policy and stage; none if it does not exist yet.
+
+    Raises:
+      ConfigError: if the file is damaged or has another format.
+    """
+    path = out / EVALUATION
+    if not path.exists():
+        return []
+    rows = _read_object(path).get("rows")
+    if not isinstance(rows, list) or not all(map(report_rows.MAP.fits, rows)):
+        raise ConfigError(f"{path} has no list of rows: remove it to judge again.")
+    for number, row in enumerate(rows, 1):
+        where = f"{path}, row {number},"
+        report_rows.check(row, ("seed", "episodes"), report_rows.WHOLE, where)
+        report_rows.check(row, ("arm", "stage"), report_rows.NAME, where)
+        report_rows.check(row, JUDGED, report_rows.NUMBER, where)
+    return rows
+
+
+def _read_object(path: Path) -> Row:
+    """Reads one of the two files of `FORMAT`."""
+    content = report_rows.read_object(path)
+    if content.get("format") != FORMAT:
         raise ConfigError(
-            f"{path} has format {found.get('format')!r}, but only format {FORMAT} is supported."
+            f"{path} has format {content.get('format')!r}, but this version reads only format "
+            f"{FORMAT}; commit {_LAST_READER} was the last to read format 2."
         )
+    return content
 
 
 def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     """Reads the episodes of an arm, by seed."""
-    if not (run / EPISODES).exists():
-        raise ConfigError(f"{run} has no {EPISODES}, although its arm has finished.")
     by_seed: dict[int, list[Row]] = {seed: [] for seed in seeds}
     for where, row in report_rows.read_lines(run, EPISODES):
-        _check_episode(row, where)
+        report_rows.check(row, _COUNTS, report_rows.WHOLE, where)
+        report_rows.check(row, ("stage",), report_rows.NAME, where)
+        for key, kind in _BY_ROBOT.items():
+            report_rows.check(row, (key,), report_rows.list_of(kind, row["robots"]), where)
         if row["seed"] not in by_seed:
             raise ConfigError(f"{where} has seed {row['seed']}, which is not in {FACTS}.")
-        rows = by_seed[row["seed"]]
-        if rows and row["update"] < rows[-1]["update"]:
-            raise ConfigError(f"{where} goes back to update {row['update']}: it is damaged.")
-        rows.append(row)
+        by_seed[row["seed"]].append(row)
     for seed, rows in by_seed.items():
         if not rows:
             raise ConfigError(f"{run / EPISODES} has no episode of seed {seed}.")
     return tuple(_log(by_seed[seed]) for seed in seeds)
-
-
-def _check_episode(row: Row, where: str) -> None:
-    """Checks that an episode has all its values and that its lists have the right length."""
-    report_rows.check(row, _COUNTS, report_rows.WHOLE, where)
-    report_rows.check(row, ("stage",), report_rows.NAME, where)
-    for key, kind in _BY_ROBOT.items():
-        found: Any = row.get(key)
-        fits = isinstance(found, list) and len(found) == row["robots"] > 0
-        if not fits or not all(map(kind.fits, found)):
-            raise ConfigError(f"{where} has {key}, which is not a list of {row['robots']} values.")
 
 
 def _log(rows: list[Row]) -> RunLog:
@@ -209,31 +229,14 @@ def _read_judged(
     out: Path, arms: Sequence[str], seeds: Sequence[int]
 ) -> dict[tuple[str, str], dict[str, np.ndarray]]:
     """Reads the results of the final policies of finished arms."""
-    path = out / EVALUATION
-    if not path.exists():
-        raise ConfigError(f"{out} has no {EVALUATION}: its policies are not judged yet.")
-    found = report_rows.read_object(path)
-    _check_format(found, path)
-    rows: dict[tuple[str, str, int], Row] = {}
-    if not isinstance(found.get("rows"), list):
-        raise ConfigError(f"{path} has no list of rows: it is damaged.")
-    for number, row in enumerate(found["rows"], 1):
-        _check_judged(row, f"{path}, row {number},")
-        rows[row["arm"], row["stage"], row["seed"]] = row
+    rows = {(row["arm"], row["stage"], row["seed"]): row for row in read_rows(out)}
     judged = {}
     for arm, stage in ((arm, stage) for arm in arms for stage in (LAST, EXPANDED)):
         for seed in seeds:
             if (arm, stage, seed) not in rows:
-                raise ConfigError(f"{path} has no row of arm {arm}, seed {seed} on {stage}.")
+                raise ConfigError(
+                    f"{out / EVALUATION} has no row of arm {arm}, seed {seed} on {stage}."
+                )
         of_arm = [rows[arm, stage, seed] for seed in seeds]
         judged[arm, stage] = {key: np.array([row[key] for row in of_arm]) for key in JUDGED}
     return judged
-
-
-def _check_judged(row: Any, where: str) -> None:
-    """Checks that a row of the evaluation has all its values."""
-    if not report_rows.MAP.fits(row):
-        raise ConfigError(f"{where} holds no keys and values: it is damaged.")
-    report_rows.check(row, ("seed", "episodes"), report_rows.WHOLE, where)
-    report_rows.check(row, ("arm", "stage"), report_rows.NAME, where)
-    report_rows.check(row, JUDGED, report_rows.NUMBER, where)

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from swarmjax.config import Section, about
-from swarmjax.config.section import MAX_COUNT
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,11 +18,6 @@ class WatchConfig(Section):
     )
     seconds: float = field(
         default=30.0, metadata=about("shortest time between two replays, s", 1.0, 1e6)
-    )
-    level: int = field(default=0, metadata=about("number of the level to replay", 0, 9_999))
-    seed: int | None = field(
-        default=None,
-        metadata=about("seed of the policy to replay; null: the run's first seed", 0, MAX_COUNT),
     )
     extensions: str | None = field(
         default=None,

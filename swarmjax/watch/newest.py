@@ -1,4 +1,4 @@
-"""Replays one level with the newest policy of a run, in MuJoCo's C engine.
+"""Replays a level with the newest policy of a run, in MuJoCo's C engine.
 
 The weights come from the newest sound checkpoint. No code from the run directory is executed. A
 policy that needs an extension is shown only if the user names the extension's file.
@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from swarmjax import command, policy_file, words
-from swarmjax.config import ConfigError, to_dict
+from swarmjax.config import to_dict
 from swarmjax.evaluate import witness
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.replay import page as replay_page
@@ -58,14 +58,14 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
 
     run = Path(settings.run)
     trained = settle(replace(rows.read_config(run), extensions=settings.extensions))
-    seed, stage = _seed(settings, trained), _stage(trained, history)
+    seed, stage = trained.numbers[0], _stage(trained, history)
     leaves, update, _ = checkpoint.restore(run)
     name = f"update-{update}.npz"
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name
         write_policy(file, leaves, trained, update, seed)
         entrant = Entrant(name, policy_file.read(file, settings.extensions))
-    asked = [f"level={settings.level}", f"steps={trained.task.step_limit}"]
+    asked = [f"steps={trained.task.step_limit}"]
     shown, _ = witness.load(ReplayConfig, asked, [entrant], to_dict(stage))
     shown = replace(shown, extensions=settings.extensions)
     episodes = replay(shown, [entrant], Progress(disable=True))
@@ -73,22 +73,10 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
     page = replay_page.page(shown, [entrant.policy], episodes, made_by)
     several = f" of seed {seed}" if trained.seeds > 1 else ""
     sentence = (
-        f"Level {settings.level} of stage {stage.name}, by the policy{several} after "
+        f"Level 0 of stage {stage.name}, by the policy{several} after "
         f"{words.count(update, 'update')}."
     )
     return Newest(update, sentence, page)
-
-
-def _seed(settings: WatchConfig, trained: TrainConfig) -> int:
-    every = trained.numbers
-    if settings.seed is None:
-        return every[0]
-    if settings.seed not in every:
-        raise ConfigError(
-            f"seed is {settings.seed}, but {settings.run} was trained with seeds {every[0]} to "
-            f"{every[-1]}: give one of them."
-        )
-    return settings.seed
 
 
 def _stage(trained: TrainConfig, history: History | None) -> StageConfig:

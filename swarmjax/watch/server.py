@@ -16,10 +16,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from swarmjax.config import ConfigError
-from swarmjax.watch import page
+from swarmjax.pages import builder
 from swarmjax.watch.view import Views
 
 ADDRESS = "127.0.0.1"
+# The page may load only from its own server: the requests of its script, and the replay's frame.
+_SOURCES = {"img-src": "'self' data:", "connect-src": "'self'", "frame-src": "'self'"}
 _HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -42,7 +44,14 @@ class Server(ThreadingHTTPServer):
         Raises:
           ConfigError: if the port is not available.
         """
-        self.views, self.page = views, page.page(views.run)
+        self.views = views
+        self.page = builder.render(
+            "watch/watch.html",
+            styles=(builder.STYLE, "watch/watch.css"),
+            script=builder.read("watch/watch.js"),
+            sources=_SOURCES,
+            title=f"Watching {views.run}",
+        )
         self._begun: dict[socket.socket, float] = {}
         try:
             super().__init__((ADDRESS, port), Answers)
@@ -99,11 +108,11 @@ class Answers(BaseHTTPRequestHandler):
         """Answers with the content at a path."""
         if self._is_foreign():
             return
-        found = self._find(self.path.partition("?")[0])
-        if found is None:
+        answer = self._find(self.path.partition("?")[0])
+        if answer is None:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", b"There is no such page.\n")
             return
-        kind, content, frames = found
+        kind, content, frames = answer
         self._send(HTTPStatus.OK, kind, content, {"Content-Security-Policy": frames})
 
     def _find(self, path: str) -> tuple[str, bytes, str] | None:

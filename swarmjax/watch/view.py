@@ -14,24 +14,14 @@ from swarmjax.report import rows
 from swarmjax.report.rows import History
 from swarmjax.run.directory import METRICS, check_regular
 from swarmjax.run.errors import CheckpointError
-from swarmjax.watch import newest
+from swarmjax.watch import newest, status
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.newest import Newest
-from swarmjax.watch.standing import stand
 
 LOOKED_AT_S = 15.0  # the page counts as open for this long after its last request
 PAUSE_S = 0.5  # seconds between two checks of the directory
 # Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
-
-NAMES = {
-    "targets": "Success of each stage, its newest verdict, over arena control steps",
-    "contacts": "Contacts per robot of each stage, its newest verdict, over arena control steps",
-    "return": "Return per robot of each stage, its newest verdict, over arena control steps",
-    "mix": "On which stages the arenas were, over arena control steps",
-    "levels": "Levels kept for replay: their number, the share of episodes that began on them, and "
-    "their success and score, over arena control steps",
-}
 
 
 class DrawnFigures(NamedTuple):
@@ -40,7 +30,7 @@ class DrawnFigures(NamedTuple):
     Attributes:
       version: increases with each drawing.
       history: the results that the figures show; None before the first update.
-      figures: PNG files by the names in `NAMES`.
+      figures: PNG files by name.
       trouble: why the newest drawing failed; empty if it did not.
     """
 
@@ -90,10 +80,10 @@ class Views:
         """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
         drawn, replayed = self.drawn, self.replayed
-        standing = stand(self.run, self.trained)
+        now = status.read(self.run, self.trained)
         return {
-            "state": standing.state,
-            "sentence": standing.sentence,
+            "state": now.state,
+            "sentence": now.sentence,
             "facts": [] if drawn.history is None else report_page.facts(drawn.history),
             "figures": {"version": drawn.version, "names": list(drawn.figures)},
             "trouble": drawn.trouble,
@@ -106,18 +96,20 @@ class Views:
 
     def draw(self) -> float:
         """Redraws the figures if the run has logged more, and returns the seconds to rest."""
-        found = _version(self.run / METRICS)
-        if found is None or found == self._seen:
+        version = _version(self.run / METRICS)
+        if version is None or version == self._seen:
             return 0.0
+        from swarmjax.report import figures  # Matplotlib takes a second
+
         began = time.perf_counter()
         try:
             check_regular(self.run)
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
-            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures(history))
+            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures.draw(history))
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
-        self._seen = found
+        self._seen = version
         return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
 
     def replay(self) -> float:
@@ -131,8 +123,8 @@ class Views:
             return 0.0
         self._tried = update
         try:
-            found = newest.record(self.settings, self.drawn.history)
-            self.replayed = Replayed(self.replayed.version + 1, found)
+            replay = newest.record(self.settings, self.drawn.history)
+            self.replayed = Replayed(self.replayed.version + 1, replay)
         except (ConfigError, CheckpointError, PolicyError, OSError) as error:
             self.replayed = self.replayed._replace(trouble=str(error))
         return self.settings.seconds
@@ -153,22 +145,7 @@ class Views:
 def _version(path: Path) -> tuple[int, float] | None:
     """Returns a file's size and time, to detect changes; None if it is missing or empty."""
     try:
-        found = path.stat()
+        file = path.stat()
     except OSError:
         return None
-    return (found.st_size, found.st_mtime) if found.st_size else None
-
-
-def figures(history: History) -> dict[str, bytes]:
-    """Draws the figures of a run.
-
-    Returns:
-      PNG files by the names in `NAMES`, without figures that would show nothing.
-    """
-    from swarmjax.pages import figures as drawing  # Matplotlib takes a second
-    from swarmjax.report import figures as report_figures
-
-    made = report_figures.by_stage(history)
-    if len(history.names) > 1:
-        made["mix"] = report_figures.mix(history, report_figures.SMALL)
-    return {name: drawing.png(figure) for name, figure in made.items()}
+    return (file.st_size, file.st_mtime) if file.st_size else None

@@ -160,7 +160,11 @@ def test_a_file_that_is_read_is_not_written_over(steer, suite, tmp_path):
             f"video is {film}, which is given as another file: give a new name."
         ),
         (f"policy={steer}", f"out={steer}"): f"out is {steer}: give a name that ends with .html.",
-        (f"policy={steer}", f"out={page}", f"video={page}"): f"out is {page}, which is given as a",
+        (
+            f"policy={steer}",
+            f"out={tmp_path / 'b.html'}",
+            f"video={page}",
+        ): f"video is {page}: give a name that ends with .mp4.",
     }.items():
         assert refusal(replay.main, [*words, *QUICK]).startswith(sentence)
     for path in (page, film):
@@ -185,7 +189,7 @@ def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
         raise OSError("ffmpeg ended")  # imageio gives no error number
 
     monkeypatch.setattr(video, "check", lambda: None)
-    monkeypatch.setattr(video, "write", fail)
+    monkeypatch.setattr(video, "_pictures", fail)
     film = tmp_path / "a.mp4"
     words = [f"policy={steer}", *QUICK, f"out={tmp_path / 'a.html'}", f"video={film}"]
     sentence = f"video is {film}, which cannot be written: ffmpeg ended."

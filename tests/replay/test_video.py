@@ -54,7 +54,7 @@ def test_pictures_are_spread_evenly_over_time():
 
 def test_things_have_their_true_sizes():
     settings, run = _settings(), replays.wandering(3, 2)
-    model = video.build(settings, run, 1280).compile()
+    model = video.build(settings, run).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     kinds, sizes, places = model.geom_type, model.geom_size, data.geom_xpos

@@ -137,43 +137,6 @@ def test_a_panel_for_each_of_many_stages(tmp_path: Path) -> None:
     assert labelled == [False] * 26 + [True] * 8
 
 
-CELLS = [(2, 0, 0.5), (2, 0, 1.0), (3, 0, 1.0), (2, 2, 1.0), (3, 2, 1.0)]
-
-
-def test_a_grid_shows_the_last_success_of_each_cell(tmp_path: Path) -> None:
-    wide = _wide_row([0.1, 0.2, None, 0.4, 0.5])
-    figure = report_figures.grid(_history(tmp_path, [wide], _stages(CELLS)))
-    assert figure is not None
-    none, two, _ = figure.axes
-    assert (none.get_title(), two.get_title()) == ("0 obstacles", "2 obstacles")
-    # Rows stand for 2 and 3 robots, columns for 0.5 and 1 m.
-    assert [text.get_text() for text in none.texts] == ["10", "20", "", "-"]
-    assert [text.get_text() for text in two.texts] == ["", "40", "", "50"]
-    expected = np.ma.masked_invalid([[np.nan, 0.4], [np.nan, 0.5]]).astype(np.float32)
-    np.testing.assert_array_equal(two.images[0].get_array(), expected)
-    assert [label.get_text() for label in none.get_xticklabels()] == ["0.5", "1"]
-    assert [label.get_text() for label in none.get_yticklabels()] == ["2", "3"]
-
-
-@pytest.mark.parametrize(
-    ("cells", "is_grid"),
-    [
-        (CELLS, True),  # 5 of 2 x 2 x 2 cells
-        ([(2, 0, 0.5), (3, 0, 0.7), (2, 2, 1.0)], False),  # 3 of 2 x 2 x 3 cells
-        ([(2, 0, 0.5), (2, 0, 0.7), (2, 0, 1.0)], False),  # a single row
-        ([(5, 3, 1.2)], False),
-    ],
-)
-def test_a_grid_is_told_by_its_cells(cells: list[tuple[int, int, float]], is_grid: bool) -> None:
-    found = report_figures.cells_of(_stages(cells))
-    assert found == ({(r, o, (s, s)): i for i, (r, o, s) in enumerate(cells)} if is_grid else None)
-
-
-def test_stages_that_share_a_cell_make_no_grid() -> None:
-    stages = _stages(CELLS)
-    assert report_figures.cells_of((*stages, replace(stages[0], name="again"))) is None
-
-
 def _panel(history: History, title: str) -> Axes:
     figure = report_figures.curves(history)
     assert figure is not None
@@ -209,9 +172,9 @@ def test_a_run_without_these_numbers_has_no_curves(tmp_path: Path) -> None:
 
 def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
     wide = _wide_row([0.1, 0.2, None, 0.4, 0.5], entropy=1.0)
-    history = _history(tmp_path, [wide], _stages(CELLS))
+    history = _history(tmp_path, [wide], _stages([(2, 0, 0.5 + 0.1 * i) for i in range(5)]))
     files = report_figures.draw(history)
-    assert list(files) == ["mix", "success", "curves", "grid"]
+    assert list(files) == ["mix", "success", "curves"]
     assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
     assert not any(b"Matplotlib" in content for content in files.values())
     assert report_figures.draw(history) == files

@@ -168,8 +168,6 @@ def test_a_row_that_does_not_fit_is_named(given: dict, what: str, tmp_path: Path
     [
         ({"targets_reached": "0.5"}, " has no number as targets_reached: it is damaged."),
         ({"all_reached": [0.5]}, " has no number as all_reached: it is damaged."),
-        ({"weights": [1.0, 0.0]}, " has no shares by stage as weights: it is damaged."),
-        ({"weights": {"pair": "1"}}, ", weights, has no number as pair: it is damaged."),
     ],
 )
 def test_a_decision_that_does_not_fit_is_named(given: dict, what: str, tmp_path: Path) -> None:

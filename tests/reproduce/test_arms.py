@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from sentences import refusal
@@ -11,9 +10,9 @@ from sentences import refusal
 from swarmjax.config import build, to_dict
 from swarmjax.reproduce import arms as reproduce_arms
 from swarmjax.reproduce.config import ARMS, ReproduceConfig
+from swarmjax.reproduce.rows import summaries
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.signals import Stop
 
 OUT = Path("somewhere") / "a=b, c"
 MADE = {arm: reproduce_arms.settings(ReproduceConfig(), arm, OUT) for arm in ARMS}
@@ -49,54 +48,30 @@ def test_each_arm_has_its_directory_and_its_log() -> None:
         assert made.run.episodes
 
 
-def test_options_reach_the_arms() -> None:
-    given = ReproduceConfig(
-        rollout_length=3000,
-        epochs=40,
-        time_out="leak",
-        step_limit=750,
-        threshold=0.5,
-        robot="planar",
-    )
-    made = reproduce_arms.settings(given, "curriculum", OUT)
-    assert (made.algo.rollout_length, made.algo.epochs, made.algo.time_out) == (3000, 40, "leak")
-    assert (made.task.step_limit, made.curriculum.threshold) == (750, 0.5)
-    assert made.robot == load_train([]).robot
-
-
 def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
     made = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
     run = tmp_path / "baseline"
     run.mkdir()
-    other = to_dict(replace(made, budget=12_000))
+    other = to_dict(replace(made, seeds=5))
     (run / "config.json").write_text(json.dumps(other))
-    assert refusal(reproduce_arms.run, made, Stop()) == (
-        f"{run} holds a run whose config differs from the one that this version makes: "
-        "give another out."
-    )
+    sentence = refusal(reproduce_arms.settings, ReproduceConfig(), "baseline", tmp_path)
+    assert f"{run} holds a run with other settings: seeds is 10 and not 5." in sentence
 
 
-def test_an_arm_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_arm_that_was_stopped_goes_on(tmp_path: Path) -> None:
     made = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
     (tmp_path / "baseline").mkdir()
     stored = to_dict(replace(made, run=replace(made.run, id="first")))
     (tmp_path / "baseline" / "config.json").write_text(json.dumps(stored))
-    trained: list[TrainConfig] = []
-
-    def carry_out(settings: TrainConfig, *_: object) -> SimpleNamespace:
-        trained.append(settings)
-        return SimpleNamespace(update=settings.updates)
-
-    monkeypatch.setattr(reproduce_arms.lifecycle, "carry_out", carry_out)
-    assert reproduce_arms.run(made, Stop())
-    assert (trained[0].resume, trained[0].run.id) == (str(tmp_path / "baseline"), "first")
+    again = reproduce_arms.settings(ReproduceConfig(), "baseline", tmp_path)
+    assert (again.resume, again.run.id) == (str(tmp_path / "baseline"), "first")
 
 
 @pytest.mark.parametrize("spent", [True, False])
 def test_an_arm_is_done_when_its_budget_is_spent(spent: bool, tmp_path: Path) -> None:
     (tmp_path / "baseline").mkdir()
     (tmp_path / "baseline" / "summary.json").write_text(json.dumps({"budget_spent": spent}))
-    assert list(reproduce_arms.summaries(tmp_path)) == (["baseline"] if spent else [])
+    assert list(summaries(tmp_path)) == (["baseline"] if spent else [])
 
 
 def test_the_config_is_one_that_is_stored() -> None:

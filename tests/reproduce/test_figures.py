@@ -13,7 +13,7 @@ from reproductions import log, reproduction, whole
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import figures, measures
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.raster import columns, raster
+from swarmjax.reproduce.figures import columns, raster
 from swarmjax.reproduce.rows import LAST
 
 PAIR = ("curriculum", "baseline")
@@ -69,7 +69,7 @@ def test_curves_are_rolling_means_and_their_interquartile_mean() -> None:
         return np.full((30, 2), amount)
 
     seeds = [log([True] * 30, reward=paid(amount)) for amount in (1.0, 2.0, 6.0)]
-    panel = figures.Panel(label="reward", of=measures.first_reward, stage=None)
+    panel = figures.Panel(measures.first_reward)
     figure = figures.curves(
         reproduction({"baseline": seeds}), ("baseline",), panels=(panel,), axes=("episode", "steps")
     )
@@ -86,7 +86,7 @@ def test_curves_are_rolling_means_and_their_interquartile_mean() -> None:
 def test_no_mean_is_drawn_where_a_seed_has_no_episodes() -> None:
     stage = np.array(["paper1"] * 30)
     seeds = [log([True] * 30), log([True] * 30), log([True] * 30, stage=stage)]
-    panel = figures.Panel(label="reward", of=measures.first_reward, stage=LAST)
+    panel = figures.Panel(measures.first_reward, LAST)
     data = reproduction({"curriculum": seeds})
     figure = figures.curves(data, ("curriculum",), panels=(panel,), axes=("steps",))
     assert [len(line) for line in _curve(figure, 0, 0.5)] == [11, 11, 0]

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reproductions import SEEDS, episode, row, whole, write
+from reproductions import SEEDS, SUMMARY, episode, row, whole, write
 from sentences import refusal
 
 from swarmjax.reproduce import claims as reproduce_claims
 from swarmjax.reproduce import page as reproduce_page
-from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST
+from swarmjax.reproduce.config import ARMS
+from swarmjax.reproduce.rows import EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
 HOSTILE = "</style><script>alert(1)</script>"
@@ -64,9 +65,9 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
         for seed in SEEDS
         for stage in (LAST, EXPANDED)
     ]
-    (out / "evaluation.json").write_text(json.dumps({"format": 2, "rows": judged}))
-    facts = json.loads((out / "reproduce.json").read_text())
-    (out / "reproduce.json").write_text(json.dumps(facts | {"commit": {"curriculum": HOSTILE}}))
+    (out / "evaluation.json").write_text(json.dumps({"format": 3, "rows": judged}))
+    hostile = SUMMARY | {"commit": HOSTILE, "device": None, "train_s": None}
+    (out / "baseline" / "summary.json").write_text(json.dumps(hostile))
     page = reproduce_page.write(out)
     assert page == out / "report.html"
     return out, Page(page.read_text())
@@ -74,12 +75,16 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
 
 def test_the_header_says_how_the_data_came_about(partial: tuple[Path, Page]) -> None:
     _, page = partial
-    assert "python -m swarmjax.reproduce seeds=3 budget=1000000 sim.impl=jax" in page.text
+    assert "python -m swarmjax.reproduce seeds=3 budget=1000000 fine_tune=250000" in page.text
     assert "1,000,000 arena control steps of each seed" in page.text
     assert HOSTILE in page.text
     made = ["60 s", "60 s", "CPU x86_64, 2 cores"]
-    assert page.starting("curriculum")[0] == ["curriculum", ARMS["curriculum"], *made]
-    assert page.starting("baseline")[0][2:] == ["60 s", "60 s", "unknown"]
+    assert page.starting("curriculum")[0] == [
+        "curriculum",
+        "the paper's algorithm with its curriculum",
+        *made,
+    ]
+    assert page.starting("baseline")[0][2:] == ["unknown", "60 s", "unknown"]
     assert page.starting("modern_baseline")[0][2:] == ["not trained to the end", "", ""]
 
 
@@ -119,13 +124,11 @@ def test_where_success_becomes_steady(partial: tuple[Path, Page]) -> None:
 
 
 def test_every_claim_has_its_verdict(partial: tuple[Path, Page]) -> None:
-    out, page = partial
+    _, page = partial
     for claim in reproduce_claims.CLAIMS:
         [found] = [found for found in page.rows if found[0].startswith(claim.quote)]
         assert re.match("reproduced|not reproduced|undecidable", found[1])
         assert claim.criterion in page.text
-    lines = (out / "verdicts.md").read_text().splitlines()
-    assert sum(line.startswith('| "') for line in lines) == len(reproduce_claims.CLAIMS)
     total = re.search(
         r"Of (\d+) claims: (\d+) reproduced, (\d+) not reproduced, (\d+) und", page.text
     )
@@ -207,5 +210,5 @@ def test_ten_seeds_of_six_arms_stay_below_two_megabytes(tmp_path: Path) -> None:
         for seed in range(10)
         for stage in (LAST, EXPANDED)
     ]
-    page = reproduce_page.write(write(tmp_path, logs, judged, seeds=list(range(10))))
+    page = reproduce_page.write(write(tmp_path, logs, judged, seeds=10))
     assert page.stat().st_size < 2_000_000

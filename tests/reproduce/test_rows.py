@@ -9,7 +9,6 @@ from reproductions import SEEDS, episode, row, whole, write
 from sentences import refusal
 
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.config import ARMS
 from swarmjax.reproduce.rows import EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
@@ -32,7 +31,7 @@ def test_episodes_are_laid_out_by_robot(tmp_path: Path) -> None:
     )
     second = episode(2, reached=[True, True, False], reward=[1, 0.5, 0.125])
     data = reproduce_rows.read(write(tmp_path, {"curriculum": _three(first, second)}))
-    assert data.seeds == SEEDS
+    assert tuple(data.seeds) == SEEDS
     assert len(data.logs["curriculum"]) == 3
     log = data.logs["curriculum"][1]
     # An absent robot reaches no target and collects no reward.
@@ -79,10 +78,6 @@ def test_an_arm_that_has_not_finished_is_left_out(tmp_path: Path) -> None:
     assert data.lacking(("baseline", "modern_curriculum")) == ["modern_curriculum"]
 
 
-def test_the_arms_are_those_that_are_trained() -> None:
-    assert tuple(reproduce_rows.ARMS) == ARMS
-
-
 def _change(out: Path, name: str, **given: object) -> None:
     found = json.loads((out / name).read_text())
     (out / name).write_text(json.dumps(found | given))
@@ -102,40 +97,45 @@ def _drop(out: Path, text: str) -> None:
 
 REFUSED = {
     "no facts": (lambda out: (out / "reproduce.json").unlink(), "is not a reproduction"),
-    "format": (lambda out: _change(out, "reproduce.json", format=1), "has format 1"),
-    "no arm": (lambda out: _change(out, "reproduce.json", seconds={}), "no finished arm"),
-    "two seeds": (
-        lambda out: _change(out, "reproduce.json", seeds=[0, 1]),
-        "has 2 seeds: an interval needs 3 or more",
+    "format": (
+        lambda out: _change(out, "reproduce.json", format=2),
+        "has format 2, but this version reads only format 3; commit d8b3078 was the last to read "
+        "format 2.",
     ),
-    "seeds": (lambda out: _change(out, "reproduce.json", seeds=["0"] * 3), "as seeds"),
-    "budget": (lambda out: _change(out, "reproduce.json", budget=None), "as budget"),
-    "seconds": (lambda out: _change(out, "reproduce.json", seconds={"baseline": "x"}), "seconds"),
+    "settings": (lambda out: _change(out, "reproduce.json", settings=[]), "as settings"),
+    "a setting": (
+        lambda out: _change(out, "reproduce.json", settings={"seeds": 2}),
+        "settings.seeds is 2: give 3 to 4096.",
+    ),
+    "no arm": (
+        lambda out: [_change(out, f"{arm}/summary.json", budget_spent=False) for arm in PAIR],
+        "no finished arm",
+    ),
+    "seconds": (lambda out: _change(out, "baseline/summary.json", train_s="x"), "as train_s"),
     "no log": (
         lambda out: (out / "baseline" / "episodes.jsonl").unlink(),
         "baseline has no episodes.jsonl",
     ),
     "a seed": (lambda out: _drop(out, '"seed": 2'), "no episode of seed 2"),
     "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
-    "an update": (lambda out: _append(out, seed=0, update=1), "goes back to update 1"),
-    "lengths": (lambda out: _append(out, sensed=[1]), "has sensed, which is not a list of 2"),
+    "lengths": (lambda out: _append(out, sensed=[1]), "has no list of 2 whole numbers as sensed"),
     "no robots": (
         lambda out: _append(
             out, robots=0, reached=[], reward=[], robot_steps=[], sensed=[], contacts=[]
         ),
-        "has reached",
+        "as reached",
     ),
-    "kinds": (lambda out: _append(out, reached=[1, 0]), "has reached"),
-    "counts": (lambda out: _append(out, contacts=[-1, 0]), "has contacts"),
-    "nan": (lambda out: _append(out, reward=[float("nan"), 0.0]), "has reward"),
+    "kinds": (lambda out: _append(out, reached=[1, 0]), "as reached"),
+    "counts": (lambda out: _append(out, contacts=[-1, 0]), "as contacts"),
+    "nan": (lambda out: _append(out, reward=[float("nan"), 0.0]), "as reward"),
     "stage": (lambda out: _append(out, stage=6), "as stage"),
     "no evaluation": (
         lambda out: (out / "evaluation.json").unlink(),
-        "has no evaluation.json",
+        "evaluation.json has no row of arm curriculum, seed 0 on paper6",
     ),
     "no rows": (
         lambda out: _change(out, "evaluation.json", rows=None),
-        "has no list of rows: it is damaged.",
+        "has no list of rows: remove it to judge again.",
     ),
     "rows": (
         lambda out: _change(out, "evaluation.json", rows=[row("baseline", 0, LAST)]),
@@ -147,7 +147,7 @@ REFUSED = {
         ),
         "as return",
     ),
-    "a row": (lambda out: _change(out, "evaluation.json", rows=[[]]), "row 1, holds no keys"),
+    "a row": (lambda out: _change(out, "evaluation.json", rows=[[]]), "has no list of rows"),
 }
 
 

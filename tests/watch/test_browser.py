@@ -32,7 +32,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
     _, _, state = lifecycle.begin(TRAINED)
     with Checkpoints(run, keep=1) as checkpoints:
         checkpoints.save(state, 0)
-    made = Views(WatchConfig(run=str(run), seed=1, level=3))
+    made = Views(WatchConfig(run=str(run)))
     made.draw()
     made.replay()
     return made
@@ -51,12 +51,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     yield from chromium.browsers(tmp_path_factory.mktemp("profile"))
 
 
-def test_the_newest_policy_of_a_seed_is_replayed(views: Views) -> None:
+def test_the_newest_policy_of_the_first_seed_is_replayed(views: Views) -> None:
     assert views.replayed.trouble == ""
     newest = views.replayed.newest
     assert newest is not None
     assert newest.update == 0
-    assert newest.sentence == ("Level 3 of stage pair, by the policy of seed 1 after 0 updates.")
+    assert newest.sentence == ("Level 0 of stage pair, by the policy of seed 0 after 0 updates.")
 
 
 def test_a_policy_is_replayed_once(views: Views) -> None:
@@ -73,11 +73,11 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     browser.get(server.url)
     wait = WebDriverWait(browser, 60)
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
-    wait.until(lambda _: browser.execute_script(drawn) == 4)
-    standing = browser.find_element("id", "standing")
-    assert standing.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
+    wait.until(lambda _: browser.execute_script(drawn) == 2)
+    status = browser.find_element("id", "status")
+    assert status.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
     assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
-    assert "by the policy of seed 1" in browser.find_element("id", "seen").text
+    assert "by the policy of seed 0" in browser.find_element("id", "seen").text
     browser.switch_to.frame("replay")
     wait.until(lambda _: browser.execute_script("return !!window.replay?.ready"))
     browser.switch_to.default_content()
@@ -92,7 +92,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     }
     paths = {url.removeprefix(server.url) for url in asked if url.startswith(server.url)}
     assert len(paths) == len(asked - {"data:,"})  # the icon is an empty data URL
-    assert {"", "state.json", "figures/targets.png?1", "replay.html?1"} <= paths
+    assert {"", "state.json", "figures/success.png?1", "replay.html?1"} <= paths
     assert browser.get_log("browser") == []  # no errors, no breach of the security policy
 
 

@@ -23,11 +23,10 @@ from swarmjax.config.section import ByName
 from swarmjax.run import directory
 from swarmjax.run.directory import Writer
 from swarmjax.watch import __main__ as watch
-from swarmjax.watch import newest, standing
+from swarmjax.watch import newest, status
 from swarmjax.watch import server as watch_server
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.server import Server
-from swarmjax.watch.standing import stand
 from swarmjax.watch.view import Views
 
 UPDATES = CONFIG.updates
@@ -102,7 +101,7 @@ def test_it_listens_on_the_loopback_alone(server: Server) -> None:
         ("/", "text/html; charset=utf-8"),
         ("/?a=b", "text/html; charset=utf-8"),
         ("/state.json", "application/json"),
-        ("/figures/targets.png", "image/png"),
+        ("/figures/success.png", "image/png"),
         ("/figures/mix.png?2", "image/png"),
     ],
 )
@@ -172,12 +171,12 @@ def test_a_line_that_is_half_written_is_left_out(tmp_path: Path) -> None:
     assert views.drawn.history is not None
     assert views.drawn.history.updates.tolist() == [0, 1]
     assert views.state()["trouble"] == ""
-    assert standing.progress(run, 1) == (2, 60.0)
+    assert status.progress(run, 1) == (2, 60.0)
 
 
 def test_updates_count_when_every_seed_has_written_them(tmp_path: Path) -> None:
     rows = [row(0, 0), row(0, 1), row(1, 0)]
-    assert standing.progress(write(tmp_path / "run", rows), 2).done == 1
+    assert status.progress(write(tmp_path / "run", rows), 2).done == 1
 
 
 def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None:
@@ -189,7 +188,7 @@ def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None
     views.draw()
     state = views.state()
     assert "in line 2" in state["trouble"]
-    assert "targets" in state["figures"]["names"]
+    assert "success" in state["figures"]["names"]
 
 
 def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None:
@@ -207,7 +206,7 @@ def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None
 
 
 def _state(run: Path) -> tuple[str, str]:
-    return stand(run, CONFIG)
+    return status.read(run, CONFIG)
 
 
 def test_a_run_whose_lock_is_held_trains(tmp_path: Path) -> None:
@@ -328,7 +327,7 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
 def test_an_update_that_is_no_number_counts_as_none(tmp_path: Path, number: str) -> None:
     run = write(tmp_path / "run", [row(0)])
     (run / "metrics.jsonl").write_text(f'{{"update": {number}, "seed": 0}}\n')
-    assert standing.progress(run, 1).done == 0
+    assert status.progress(run, 1).done == 0
 
 
 @pytest.mark.parametrize("name", ["metrics.jsonl", ".lock", "pipe"])
@@ -342,12 +341,6 @@ def test_a_pipe_in_the_directory_is_said_without_waiting(tmp_path: Path, name: s
     views.draw()
     with pytest.raises(ConfigError, match="is neither a file nor a folder"):
         Views(WatchConfig(run=str(run)))
-
-
-def test_a_seed_that_the_run_has_not_is_refused(tmp_path: Path) -> None:
-    run = write(tmp_path / "run", [row(0)])
-    with pytest.raises(ConfigError, match=r"^seed is 4, but .* was trained with seeds 0 to 0"):
-        newest.record(WatchConfig(run=str(run), seed=4), None)
 
 
 # The command

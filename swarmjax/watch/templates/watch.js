@@ -14,7 +14,6 @@ function say(id, text) {
 function showFigures({ version, names }) {
   if (version === shown.figures) return;
   shown.figures = version;
-  page("explained").hidden = !names.length;
   for (const figure of document.querySelectorAll("figure")) {
     if (!names.includes(figure.id)) continue;
     const next = new Image(); // shown when it is whole, so that nothing flickers
@@ -51,8 +50,8 @@ function showFacts(facts) {
 async function look() {
   try {
     const found = await (await fetch("/state.json")).json();
-    page("standing").className = found.state;
-    say("standing", found.sentence);
+    page("status").className = found.state;
+    say("status", found.sentence);
     say("trouble", found.trouble);
     showFigures(found.figures);
     showFacts(found.facts);

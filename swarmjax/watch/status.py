@@ -19,7 +19,7 @@ SILENT_S = 120.0
 _TAIL = 2**22  # bytes that hold the newest rows of all seeds
 
 
-class Standing(NamedTuple):
+class RunStatus(NamedTuple):
     """State of a run.
 
     Attributes:
@@ -73,7 +73,7 @@ def progress(run: Path, seeds: int) -> Progress:
     return Progress(done, seconds if isinstance(seconds, int | float) else None)
 
 
-def stand(run: Path, trained: TrainConfig) -> Standing:
+def read(run: Path, trained: TrainConfig) -> RunStatus:
     """Returns the current state of a run.
 
     Args:
@@ -81,34 +81,36 @@ def stand(run: Path, trained: TrainConfig) -> Standing:
       trained: its config.
     """
     if not (run / directory.CONFIG).exists():
-        return Standing("silent", f"{run} is gone.")
+        return RunStatus("silent", f"{run} is gone.")
     try:
         directory.check_regular(run)
     except ConfigError as error:
-        return Standing("silent", str(error))
-    found, writer, age = progress(run, trained.seeds), directory.writer(run), _age(run)
-    so_far = f"{found.done:,} of {words.count(trained.updates, 'update')}"
+        return RunStatus("silent", str(error))
+    logged, writer, age = progress(run, trained.seeds), directory.writer(run), _age(run)
+    so_far = f"{logged.done:,} of {words.count(trained.updates, 'update')}"
     if writer is not None and writer.is_here and directory.is_writing(writer):
-        left = _left(trained, found)
-        return Standing("trains", f"It trains: {so_far} done{left}; {_written(age)}.")
-    if found.done >= trained.updates:
-        return Standing("ended", f"It has ended: all {words.count(found.done, 'update')} are done.")
+        left = _left(trained, logged)
+        return RunStatus("trains", f"It trains: {so_far} done{left}; {_written(age)}.")
+    if logged.done >= trained.updates:
+        return RunStatus(
+            "ended", f"It has ended: all {words.count(logged.done, 'update')} are done."
+        )
     on = f"Go on with: {command.line('train', f'resume={run}')}"
-    if found.done and _summed_up(run) == found.done:
-        return Standing("stopped", f"It was stopped after {so_far}, with all saved. {on}")
+    if logged.done and _summed_up(run) == logged.done:
+        return RunStatus("stopped", f"It was stopped after {so_far}, with all saved. {on}")
     if writer is not None and not writer.is_here:
         return _elsewhere(f"{so_far} done on {writer.host}", age)
     saved = "" if (run / CHECKPOINTS).exists() else " It had saved nothing."
-    return Standing(
+    return RunStatus(
         "killed", f"It was killed, or broke, after {so_far}; {_written(age)}.{saved} {on}"
     )
 
 
-def _elsewhere(so_far: str, age: float | None) -> Standing:
+def _elsewhere(so_far: str, age: float | None) -> RunStatus:
     """Returns the state of a run whose process is on another machine."""
     if age is not None and age < SILENT_S:
-        return Standing("elsewhere", f"It trains: {so_far}; {_written(age)}.")
-    return Standing(
+        return RunStatus("elsewhere", f"It trains: {so_far}; {_written(age)}.")
+    return RunStatus(
         "silent",
         f"It was killed or is still training, and this machine cannot tell which: {so_far}; "
         f"{_written(age)}.",
@@ -118,10 +120,10 @@ def _elsewhere(so_far: str, age: float | None) -> Standing:
 def _age(run: Path) -> float | None:
     """Returns the seconds since the run last logged an update; None if it has logged none."""
     try:
-        found = (run / directory.METRICS).stat()
+        file = (run / directory.METRICS).stat()
     except OSError:
         return None
-    return max(0.0, time.time() - found.st_mtime) if found.st_size else None
+    return max(0.0, time.time() - file.st_mtime) if file.st_size else None
 
 
 def _written(age: float | None) -> str:
@@ -130,18 +132,18 @@ def _written(age: float | None) -> str:
     return f"the newest update was written {words.duration(round(age))} ago"
 
 
-def _left(trained: TrainConfig, found: Progress) -> str:
+def _left(trained: TrainConfig, logged: Progress) -> str:
     """Describes the time that a run has left, from its mean time per update."""
-    if not found.done or found.seconds is None or found.done >= trained.updates:
+    if not logged.done or logged.seconds is None or logged.done >= trained.updates:
         return ""
-    seconds = found.seconds / found.done * (trained.updates - found.done)
+    seconds = logged.seconds / logged.done * (trained.updates - logged.done)
     return f", about {words.duration(round(seconds))} left"
 
 
 def _summed_up(run: Path) -> int | None:
     """Returns the updates in the summary, the last file that a run writes; None without one."""
     try:
-        found = rows.read_object(run / directory.SUMMARY).get("updates")
+        updates = rows.read_object(run / directory.SUMMARY).get("updates")
     except (ConfigError, OSError):
         return None
-    return found if isinstance(found, int) else None
+    return updates if isinstance(updates, int) else None
