@@ -134,6 +134,28 @@ class Section:
         """
 
 
+def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[str]]]) -> None:
+    """Refuses an option that nothing would read.
+
+    Args:
+      section: the settings.
+      options: for each option, the key that decides whether it is read, and the values of that key
+        with which it is. With other values, the option must have its default.
+
+    Raises:
+      ConfigError: an option has another value than its default, and is not read.
+    """
+    defaults = {item.name: item.default for item in dataclasses.fields(section)}
+    for key, (selector, choices) in options.items():
+        value, chosen, default = getattr(section, key), getattr(section, selector), defaults[key]
+        if chosen not in choices and value != default:
+            raise ConfigError(
+                f"{key} is {show(value, quote='')}, but {selector} is {chosen}: {key} is an option "
+                f"of {' and '.join(choices)}, so give {show(default, quote='')} or "
+                f"{selector}={choices[0]}."
+            )
+
+
 class ByName(dict[str, Any]):
     """A mapping to values from names that no section defines.
 

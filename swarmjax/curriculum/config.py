@@ -1,35 +1,24 @@
 """The settings of the curriculum."""
 
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
-from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config import Section, about
+from swarmjax.config.section import MAX_COUNT, check_options
 
-# The modes that read an option; other modes accept only its default.
 _STEPWISE, _ADAPTIVE = ("sequential", "mixed"), ("adaptive",)
-_PREPARED = "adaptive with prerequisites"
-_READ_BY: dict[str, tuple[str, ...]] = {
-    "earlier_share": ("mixed",),
-    "optimizer": _STEPWISE,
-    "exploration": _STEPWISE,
-    "prerequisites": _ADAPTIVE,
-    "score": _ADAPTIVE,
-    "floor": _ADAPTIVE,
-    "shares": _ADAPTIVE,
+_PROMOTING = (*_STEPWISE, "adaptive with prerequisites")
+# The modes that read an option.
+_READ_BY: dict[str, tuple[str, Sequence[str]]] = {
+    "earlier_share": ("mode", ("mixed",)),
+    "optimizer": ("mode", _STEPWISE),
+    "exploration": ("mode", _STEPWISE),
+    "prerequisites": ("mode", _ADAPTIVE),
+    "score": ("mode", _ADAPTIVE),
+    "floor": ("mode", _ADAPTIVE),
+    "shares": ("mode", _ADAPTIVE),
 }
-
-
-def _check_read(section: Section, mode: str, read_by: dict[str, tuple[str, ...]]) -> None:
-    """Refuses a value for an option that the mode does not read."""
-    for item in fields(section):
-        value, modes = getattr(section, item.name), read_by.get(item.name, (mode,))
-        if mode not in modes and value != item.default:
-            raise ConfigError(
-                f"{item.name} is {show(value, quote='')}, but mode is {mode}: {item.name} is an "
-                f"option of {' and '.join(modes)}, so give {show(item.default, quote='')} or "
-                f"mode={modes[0]}."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +66,9 @@ class LevelsConfig(Section):
     )
 
     def _check(self) -> None:
-        buffered = ("learnability", "value_loss")
+        buffered = ("mode", ("learnability", "value_loss"))
         keys = ("buffer", "replay", "temperature", "staleness")
-        _check_read(self, self.mode, dict.fromkeys(keys, buffered))
+        check_options(self, dict.fromkeys(keys, buffered))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,5 +154,5 @@ class CurriculumConfig(Section):
     levels: LevelsConfig = field(default_factory=LevelsConfig)
 
     def _check(self) -> None:
-        promoting = dict.fromkeys(("threshold", "budget_share"), (*_STEPWISE, _PREPARED))
-        _check_read(self, self.mode, _READ_BY | ({} if self.prerequisites else promoting))
+        promoting = dict.fromkeys(("threshold", "budget_share"), ("mode", _PROMOTING))
+        check_options(self, _READ_BY | ({} if self.prerequisites else promoting))

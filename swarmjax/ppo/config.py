@@ -2,20 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from swarmjax.config import ConfigError, Section, about, show
-from swarmjax.config.section import MAX_COUNT
+from swarmjax.config.section import MAX_COUNT, check_options
 from swarmjax.extension import Network
 
-# Options that exist for one choice only: the key and value of the choice, and the meaning of null.
-_ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
-    "gae_lambda": ("advantage", "gae", 0.95),
-    "memory_size": ("memory", "gru", 64),
-    "guess_cost": ("critic", "state", 0.02),
-    "std_decrement": ("exploration", "scheduled", 0.05),
-    "std_interval": ("exploration", "scheduled", 250_000),
-    "std_floor": ("exploration", "scheduled", 0.1),
+# Options that exist for one choice of another key: this key, and the choice.
+_READ_BY: dict[str, tuple[str, Sequence[str]]] = {
+    "gae_lambda": ("advantage", ("gae",)),
+    "memory_size": ("memory", ("gru",)),
+    "guess_cost": ("critic", ("state",)),
+    "std_decrement": ("exploration", ("scheduled",)),
+    "std_interval": ("exploration", ("scheduled",)),
+    "std_floor": ("exploration", ("scheduled",)),
 }
 
 
@@ -23,7 +23,7 @@ _ALGO_OPTIONS: dict[str, tuple[str, str, float | int]] = {
 # drives about as far as it sees.
 LEAST_SEQUENCE = 8
 
-# How a return may treat the step limit, the default first.
+# How a return may treat the step limit.
 _TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
 
 
@@ -31,9 +31,7 @@ _TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "lea
 class AlgoConfig(Section):
     """Settings of PPO; names in quotes are those in Table 1 of the paper.
 
-    Some options belong to one choice of another key; the meanings of the options name this choice.
-    Such an option is null with the other choices. With the choice that the option belongs to, null
-    means the option's default.
+    Some options are read with one choice of another key alone; their meanings name it in brackets.
     """
 
     name: Literal["ppo", "paper"] = field(
@@ -48,13 +46,6 @@ class AlgoConfig(Section):
             "network of actor and critic: mlp or an extension's; null: the extension's, if any"
         ),
     )
-    torso: Any = field(
-        default=None, metadata=about("module of an extension's network", derived=True, stored=False)
-    )
-    hearing: Any = field(
-        default=None,
-        metadata=about("where neighbours stand in an observation", derived=True, stored=False),
-    )
     hidden_sizes: tuple[int, ...] = field(
         default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
     )
@@ -62,18 +53,7 @@ class AlgoConfig(Section):
         default="none",
         metadata=about("memory of the robots; gru: a gated recurrent unit after the layers"),
     )
-    memory_size: int | None = field(
-        default=None,
-        metadata=about("size of the memory; null: 64 [memory=gru]", 1, 1024),
-    )
-    memory_kernels: Any = field(
-        default=None,
-        metadata=about("module that computes the memory on a GPU", derived=True, stored=False),
-    )
-    side_by_side: int = field(
-        default=1,
-        metadata=about("learners that a device trains at once", derived=True, stored=False),
-    )
+    memory_size: int = field(default=64, metadata=about("size of the memory [memory=gru]", 1, 1024))
     critic: Literal["observation", "state"] = field(
         default="observation",
         metadata=about(
@@ -122,18 +102,18 @@ class AlgoConfig(Section):
             "normalised, for both critic and advantages"
         ),
     )
-    gae_lambda: float | None = field(
-        default=None, metadata=about("GAE's lambda; null: 0.95 [advantage=gae]", 0.0, 1.0)
+    gae_lambda: float = field(
+        default=0.95, metadata=about("GAE's lambda [advantage=gae]", 0.0, 1.0)
     )
     normalize_advantages: bool = field(
         default=True,
         metadata=about("scale gae's advantages to mean 0 and deviation 1 over the rollout"),
     )
-    time_out: Literal["bootstrap", "terminal", "leak"] | None = field(
-        default=None,
+    time_out: Literal["bootstrap", "terminal", "leak"] = field(
+        default="bootstrap",
         metadata=about(
             "the return at the step limit; bootstrap: adds the critic's value [gae]; terminal: "
-            "ends; leak: goes on into the next episode [monte_carlo]; null: bootstrap or terminal"
+            "ends; leak: goes on into the next episode [monte_carlo]"
         ),
     )
     clip_epsilon: float = field(
@@ -172,11 +152,11 @@ class AlgoConfig(Section):
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
-    guess_cost: float | None = field(
-        default=None,
+    guess_cost: float = field(
+        default=0.02,
         metadata=about(
-            "weight of the squared error of the policy's guess of the state that the critic sees; "
-            "null: 0.02 [critic=state]",
+            "weight of the squared error of the policy's guess of the state that the critic sees "
+            "[critic=state]",
             0.0,
         ),
     )
@@ -200,28 +180,27 @@ class AlgoConfig(Section):
         default=0.6,
         metadata=about("first deviation: 'starting std of action distribution'", above=0.0),
     )
-    std_decrement: float | None = field(
-        default=None,
+    std_decrement: float = field(
+        default=0.05,
         metadata=about(
-            "decrease of the deviation at a time: 'the decay rate of std of action distribution'; "
-            "null: 0.05 [exploration=scheduled]",
+            "decrease of the deviation at a time: 'the decay rate of std of action distribution' "
+            "[exploration=scheduled]",
             above=0.0,
         ),
     )
-    std_interval: int | None = field(
-        default=None,
+    std_interval: int = field(
+        default=250_000,
         metadata=about(
             "control steps of all arenas between decreases: 'decay frequency of std of action "
-            "distribution'; null: 250000 [exploration=scheduled]",
+            "distribution' [exploration=scheduled]",
             1,
             MAX_COUNT,
         ),
     )
-    std_floor: float | None = field(
-        default=None,
+    std_floor: float = field(
+        default=0.1,
         metadata=about(
-            "least deviation: 'minimum std of action distribution'; null: 0.1 "
-            "[exploration=scheduled]",
+            "least deviation: 'minimum std of action distribution' [exploration=scheduled]",
             above=0.0,
         ),
     )
@@ -229,19 +208,11 @@ class AlgoConfig(Section):
     def _check(self) -> None:
         if not self.hidden_sizes:
             raise ConfigError("hidden_sizes is []: give at least one layer, as in [64,64].")
-        for key, (selector, choice, default) in _ALGO_OPTIONS.items():
-            value, chosen = getattr(self, key), getattr(self, selector)
-            if chosen != choice and value is not None:
-                raise ConfigError(
-                    f"{key} is {show(value)}, but {selector} is {chosen}: {key} is an option of "
-                    f"{choice}, so give null or {selector}={choice}."
-                )
-            if chosen == choice and value is None:
-                object.__setattr__(self, key, default)
+        check_options(self, _READ_BY)
         self._check_time_out()
         self._check_memory()
         self._check_critic()
-        if self.std_floor is not None and self.std_floor > self.initial_std:
+        if self.exploration == "scheduled" and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
                 f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
@@ -288,9 +259,7 @@ class AlgoConfig(Section):
 
     def _check_time_out(self) -> None:
         allowed = _TIME_OUTS[self.advantage]
-        if self.time_out is None:
-            object.__setattr__(self, "time_out", allowed[0])
-        elif self.time_out not in allowed:
+        if self.time_out not in allowed:
             raise ConfigError(
                 f"time_out is {self.time_out}, but advantage is {self.advantage}: "
                 f"give {' or '.join(allowed)}."

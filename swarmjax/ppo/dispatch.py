@@ -3,30 +3,28 @@
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 
 from swarmjax.config import ConfigError, show
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Metrics, Minibatch
-from swarmjax.ppo.optimizer import Progress
-from swarmjax.shards import Shards
+from swarmjax.ppo.networks import Networks, Sizes
+from swarmjax.ppo.optimizer import Learning, Progress
 
 # XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8
 # JAX's names for products without tensor cores (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: `learner` alone. blocks: autodiff of a whole batch, block by block. fused: kernels.
+# autodiff: `ppo` alone. blocks: autodiff of a whole batch, block by block. fused: kernels.
 # sequences: autodiff of a policy with memory, without the sequences of absent robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
-Learn = Callable[
-    [AlgoConfig, int, Progress, Minibatch, jax.Array, Shards], tuple[Progress, Metrics]
-]
+Learn = Callable[[Learning, Progress, Minibatch, jax.Array], tuple[Progress, Metrics]]
 
 
-def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Backend:
+def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
     """Chooses how updates are computed on the device that JAX computes on.
 
     `auto` means `fused` on an NVIDIA GPU that supports the layers, but not if JAX computes matrix
@@ -36,43 +34,39 @@ def resolve(config: AlgoConfig, observation_size: int, action_size: int) -> Back
 
     Args:
       config: Settings of the learner.
-      observation_size: O.
-      action_size: U.
+      networks: Actor and critic.
+      sizes: What they see and do.
 
     Returns:
-      The backend for `learner.update`.
+      The backend.
 
     Raises:
       ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
     """
     if config.memory != "none":  # the other faster ways handle single samples
         return "sequences" if config.update_backend == "auto" else "autodiff"
-    if _fuses(config, observation_size, action_size):
+    if _fuses(config, networks, sizes):
         return "fused"
     whole = config.num_minibatches == 1 and jax.default_backend() == "cpu"
     return "blocks" if whole else "autodiff"
 
 
-def bind_memory(config: AlgoConfig) -> AlgoConfig:
-    """Gives a config the kernels that compute its memory, on a GPU that supports them.
+def memory_kernels(config: AlgoConfig) -> Any:
+    """Returns the kernels that compute a memory; None without memory or a GPU that supports them.
 
     Args:
       config: Settings of the learner.
-
-    Returns:
-      The config with the kernels; unchanged without memory, or where `resolve` avoids kernels.
     """
     asked = config.memory != "none" and config.update_backend == "auto"
     if not asked or not _has_tensor_cores() or _is_full_precision():
-        return config
+        return None
     from swarmjax.ppo.fast import kernel, recurrence
 
-    fitting = recurrence.fits(config.memory_size or 0, kernel.shared_memory())
-    return replace(config, memory_kernels=recurrence) if fitting else config
+    return recurrence if recurrence.fits(config.memory_size, kernel.shared_memory()) else None
 
 
 def find(backend: Backend) -> Learn | None:
-    """Returns the function that learns with a backend; None for autodiff, which `learner` does."""
+    """Returns the function that learns with a backend; None for autodiff, which `ppo` does."""
     if backend == "fused":
         from swarmjax.ppo.fast import tiles
 
@@ -88,34 +82,32 @@ def find(backend: Backend) -> Learn | None:
     return None
 
 
-def _fuses(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
+def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
     """Tells whether to use the kernels; refuses `fused` where they are not available."""
     if config.update_backend == "autodiff" or config.critic == "state":
         return False
-    if config.hearing is not None:  # the kernels support no layer in front of the hidden ones
+    if sizes.hearing is not None:  # the kernels support no layer in front of the hidden ones
         return False
-    possible = _has_tensor_cores()
-    fitting = possible and _fits(config, observation_size, action_size)
+    possible, own = _has_tensor_cores(), networks.actor.torso is not None
+    fitting = possible and not own and _fits(config, sizes)
     if config.update_backend == "fused" and not possible:
         raise ConfigError(
             "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability "
             f"{_LEAST_GENERATION} or more: give auto or autodiff."
         )
     if config.update_backend == "fused" and not fitting:
-        raise _unfit(config, observation_size, action_size)
+        raise _unfit(config, sizes, own=own)
     if config.update_backend == "auto" and _is_full_precision():
         return False
     return fitting
 
 
-def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> ConfigError:
+def _unfit(config: AlgoConfig, sizes: Sizes, *, own: bool) -> ConfigError:
     """Builds the error that names what does not fit the chip: the layers or the observation."""
-    narrow = replace(config, hidden_sizes=(16, 16))
-    if config.torso is None and not _fits(narrow, observation_size, action_size):
+    if not own and not _fits(replace(config, hidden_sizes=(16, 16)), sizes):
         return ConfigError(
-            f"algo.update_backend is fused, but {observation_size} numbers are observed, more than "
-            "the kernels support: give a smaller task.history, fewer task.observations, or "
-            "algo.update_backend=auto."
+            f"algo.update_backend is fused, but {sizes.observation} numbers are observed, more "
+            "than the kernels support: give fewer task.observations, or algo.update_backend=auto."
         )
     return ConfigError(
         f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
@@ -124,13 +116,11 @@ def _unfit(config: AlgoConfig, observation_size: int, action_size: int) -> Confi
     )
 
 
-def _fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
-    """Tells whether the kernels support networks of this size."""
+def _fits(config: AlgoConfig, sizes: Sizes) -> bool:
+    """Tells whether the kernels support hidden layers of this size."""
     from swarmjax.ppo.fast import fused
 
-    if config.torso is not None:  # the kernels support hidden layers only
-        return False
-    return fused.fits(config, observation_size, action_size)
+    return fused.fits(config, sizes.observation, sizes.action)
 
 
 def _is_full_precision() -> bool:

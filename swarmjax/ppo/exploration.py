@@ -25,8 +25,6 @@ def levels(config: AlgoConfig) -> tuple[float, ...]:
 
 
 def _fall(config: AlgoConfig) -> Iterator[float]:
-    assert config.std_decrement is not None
-    assert config.std_floor is not None
     std = config.initial_std
     yield std
     while std > config.std_floor:
@@ -48,6 +46,5 @@ def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
     Returns:
       The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
     """
-    assert config.std_interval is not None
     table = jnp.asarray(levels(config), dtype=float)
     return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

@@ -1,14 +1,16 @@
 """The PPO loss of one minibatch of B samples, some of which may be invalid."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from swarmjax.ppo import networks
+from swarmjax.ppo import gaussian
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.memory import Recall
-from swarmjax.ppo.networks import Acted, Params
+from swarmjax.ppo.memory import NO_MEMORY, Recall
+from swarmjax.ppo.networks import Acted, Networks, Params
 
 Metrics = dict[str, jax.Array]
 
@@ -24,10 +26,10 @@ class Minibatch:
       advantage: [B].
       return_: [B], target of the critic.
       valid: [B], bool or 0/1.
-      memory: [B', H], memory before the first step of B' sequences; None without memory. Samples
-        are then ordered by step, [T B'].
-      begins: [B], whether an episode begins with the step; None without memory.
-      state: [B, P], numbers of order 1 that the critic sees in addition; None if there are none.
+      memory: [B', H], memory before the first step of B' sequences; () each without memory. With
+        memory, samples are ordered by step, [T B'].
+      begins: [B], whether an episode begins with the step; () without memory.
+      state: [B, P], numbers of order 1 that the critic sees in addition; () if there are none.
     """
 
     observation: jax.Array
@@ -36,13 +38,17 @@ class Minibatch:
     advantage: jax.Array
     return_: jax.Array
     valid: jax.Array
-    memory: Recall | None = None
-    begins: jax.Array | None = None
-    state: jax.Array | None = None
+    memory: Recall = NO_MEMORY
+    begins: Any = ()
+    state: Any = ()
 
 
 def ppo_loss(
-    params: Params, minibatch: Minibatch, config: AlgoConfig, expected_valid: jax.Array
+    params: Params,
+    minibatch: Minibatch,
+    networks: Networks,
+    config: AlgoConfig,
+    expected_valid: jax.Array,
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
@@ -70,6 +76,7 @@ def ppo_loss(
     Args:
       params: Parameters of the actor and the critic.
       minibatch: B samples.
+      networks: Actor and critic.
       config: Clip range and costs.
       expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
         used.
@@ -83,7 +90,7 @@ def ppo_loss(
     chex.assert_rank(
         [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
     )
-    metrics = _terms(*evaluate(params, config, minibatch), minibatch, config, expected_valid)
+    metrics = _terms(*evaluate(params, networks, minibatch), minibatch, config, expected_valid)
     return _total(metrics, config), metrics
 
 
@@ -100,21 +107,21 @@ def _terms(
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    log_prob = networks.log_prob(acted.mean, acted.std, minibatch.action)
+    log_prob = gaussian.log_prob(acted.mean, acted.std, minibatch.action)
     # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     metrics = {
         "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip_epsilon)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
-        "bound_loss": mean(jnp.sum(networks.beyond_range(acted.mean) ** 2, axis=-1)),
-        "entropy": mean(networks.entropy(acted.std)),
+        "bound_loss": mean(jnp.sum(gaussian.beyond_range(acted.mean) ** 2, axis=-1)),
+        "entropy": mean(gaussian.entropy(acted.std)),
         # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
         "approx_kl": mean(ratio - 1.0 - log_ratio),
         "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
     # Without a cost the term is left out, so that XLA does not compute the guess.
-    if config.guess_cost and acted.guess is not None and minibatch.state is not None:
+    if config.guess_cost and config.critic == "state":
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return metrics
@@ -130,35 +137,30 @@ def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
     )
     if "guess_loss" not in metrics:
         return total
-    assert config.guess_cost  # or there is no such loss
     return total + config.guess_cost * metrics["guess_loss"]
 
 
-def evaluate(params: Params, config: AlgoConfig, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
+def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
     """Runs actor and critic on samples; with memory, step by step.
 
     Args:
       params: Parameters of the actor and the critic.
+      networks: Actor and critic.
       minibatch: B samples.
-      config: The config that made `params`.
 
     Returns:
       Output of the actor, without its memory, and value [B].
     """
-    seen, memory = minibatch.observation, minibatch.memory
-    judged = networks.critic_input(seen, minibatch.state)
-    if memory is None or minibatch.begins is None:
-        acted = networks.run_actor(params, config, seen, None)
-        return acted, networks.value(params, config, judged)
-    sequences = memory.actor.shape[0]
-    begins = minibatch.begins.reshape(-1, sequences)
-    seen, judged = (x.reshape(-1, sequences, x.shape[-1]) for x in (seen, judged))
-    acted = networks.run_actor(params, config, seen, memory.actor, begins)
-    value, _ = networks.recall_value(params, config, judged, memory.critic, begins)
-    mean, guess = (
-        None if x is None else x.reshape(-1, x.shape[-1]) for x in (acted.mean, acted.guess)
-    )
-    return acted._replace(mean=mean, memory=None, guess=guess), value.reshape(-1)
+    seen, state, memory = minibatch.observation, minibatch.state, minibatch.memory
+    if not jax.tree.leaves(memory):
+        acted = networks.act(params, seen, ())
+        return acted, networks.value(params, seen, state, ())[0]
+    begins = minibatch.begins.reshape(-1, memory.actor.shape[0])
+    seen, state = jax.tree.map(lambda x: x.reshape(*begins.shape, -1), (seen, state))
+    acted = networks.act(params, seen, memory.actor, begins)
+    value, _ = networks.value(params, seen, state, memory.critic, begins)
+    mean, guess = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (acted.mean, acted.guess))
+    return acted._replace(mean=mean, memory=(), guess=guess), value.reshape(-1)
 
 
 def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:

@@ -28,15 +28,13 @@ _UNROLL = 4
 
 
 class Recall(NamedTuple):
-    """The memories of actor and critic before an observation, [B, H] each."""
+    """The memories of actor and critic before an observation, [B, H] each; () without memory."""
 
     actor: Any
     critic: Any
 
 
-def begin(shape: tuple[int, ...]) -> Recall:
-    """Returns the memory [B, H] of episodes that begin."""
-    return Recall(jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
+NO_MEMORY = Recall((), ())
 
 
 class Gru(nn.Module):

@@ -1,4 +1,4 @@
-"""Actor and critic networks, and the diagonal Gaussian that the actor describes.
+"""Actor and critic networks.
 
 B stands for any number of leading axes, O for the observation and U for the action.
 """
@@ -6,20 +6,19 @@ B stands for any number of leading axes, O for the observation and U for the act
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 
 from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import Network
-from swarmjax.ppo import memory as ppo_memory
 from swarmjax.ppo.config import AlgoConfig, resolve
-from swarmjax.ppo.memory import Gru, Recall
+from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall, uniform
 
 Params = dict[str, Any]
 
@@ -51,6 +50,22 @@ class Hearing(NamedTuple):
         return self.first + self.rows * self.width
 
 
+class Sizes(NamedTuple):
+    """What a policy sees and does.
+
+    Attributes:
+      observation: O, numbers of an observation.
+      action: U, numbers of an action.
+      state: P, numbers that the critic sees in addition.
+      hearing: place of the neighbours in an observation; None if robots do not hear.
+    """
+
+    observation: int
+    action: int
+    state: int = 0
+    hearing: Hearing | None = None
+
+
 class _Torso(nn.Module):
     """Hidden layers `hidden_0`, `hidden_1`, ...: [B, O] -> [B, hidden[-1]]."""
 
@@ -76,14 +91,14 @@ class _Head(nn.Module):
     size: int
 
     @nn.compact
-    def __call__(self, features: jax.Array, recalled: jax.Array | None) -> jax.Array:
-        seen = features.shape[-1]
-        inputs = seen if recalled is None else seen + recalled.shape[-1]
-        kernel_init, bias_init = _initializers(self.config, inputs, _HEAD_GAIN)
-        kernel = self.param("kernel", kernel_init, (inputs, self.size), jnp.float32)
+    def __call__(self, *features: jax.Array) -> jax.Array:
+        widths = [part.shape[-1] for part in features]
+        kernel_init, bias_init = _initializers(self.config, sum(widths), _HEAD_GAIN)
+        kernel = self.param("kernel", kernel_init, (sum(widths), self.size), jnp.float32)
         bias = self.param("bias", bias_init, (self.size,), jnp.float32)
-        found = features @ kernel[:seen]
-        return bias + (found if recalled is None else found + recalled @ kernel[seen:])
+        rows = jnp.split(kernel, np.cumsum(widths)[:-1])
+        products = [part @ weights for part, weights in zip(features, rows, strict=True)]
+        return bias + functools.reduce(jnp.add, products)
 
 
 class Acted(NamedTuple):
@@ -92,84 +107,101 @@ class Acted(NamedTuple):
     Attributes:
       mean: [B, U], mean action.
       std: [U], standard deviation of the action.
-      memory: [B, H], memory after; None without memory.
-      guess: [B, P], guess of the state that the critic sees; None if the critic sees no state.
+      memory: [B, H], memory after; () without memory.
+      guess: [B, P], guess of the state that the critic sees; () if the critic sees no state.
     """
 
     mean: jax.Array
     std: jax.Array
-    memory: jax.Array | None
-    guess: jax.Array | None
+    memory: Any
+    guess: Any
 
 
-class _Actor(nn.Module):
-    """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action.
+class _Network(nn.Module):
+    """The layers that actor and critic have in common: what a head sees of an observation.
 
-    If `state_size` is not 0, it also guesses the state that the critic sees (`guess`).
+    Attributes:
+      config: settings of the layers.
+      sizes: what a policy sees and does.
+      torso: an extension's network, in place of the hidden layers; None for these.
+      kernels: what computes a memory on a GPU, as in `Gru`.
     """
 
     config: AlgoConfig
-    action_size: int
-    state_size: int = 0
+    sizes: Sizes
+    torso: Any = None
+    kernels: Any = None
+
+    def _features(
+        self, seen: jax.Array, memory: Any, begins: jax.Array | None
+    ) -> tuple[tuple[jax.Array, ...], Any]:
+        """Returns the features for the heads, and the memory after."""
+        make = self.torso or functools.partial(_Torso, self.config)
+        features = make(name="torso")(_hear(self.config, self.sizes.hearing, seen))
+        if self.config.memory == "none":
+            return (features,), ()
+        recalled, memory = Gru(
+            self.config.memory_size,
+            uniform=self.config.initialization == "uniform",
+            kernels=self.kernels,
+            name="memory",
+        )(features, memory, begins)
+        return (features, recalled), memory
+
+
+class _Actor(_Network):
+    """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action.
+
+    If the critic sees a state, the actor also guesses it (`guess`).
+    """
 
     @nn.compact
     def __call__(
-        self,
-        observation: jax.Array,
-        memory: jax.Array | None = None,
-        begins: jax.Array | None = None,
+        self, observation: jax.Array, memory: Any = (), begins: jax.Array | None = None
     ) -> Acted:
-        features = _torso(self.config)(_hear(self.config, observation))
-        recalled, guess = None, None
-        if memory is not None:
-            recalled, memory = _gru(self.config)(features, memory, begins)
-        head = _Head(self.config, self.action_size, name="mean")
-        if self.state_size:
-            guess = _Head(self.config, self.state_size, name="guess")(features, recalled)
+        features, memory = self._features(observation, memory, begins)
+        head, guess = _Head(self.config, self.sizes.action, name="mean"), ()
+        if self.sizes.state:
+            guess = _Head(self.config, self.sizes.state, name="guess")(*features)
         log_std = self.param(
             "log_std",
             nn.initializers.constant(math.log(self.config.initial_std)),
-            (self.action_size,),
+            (self.sizes.action,),
             jnp.float32,
         )
-        mean = _OUTPUTS[self.config.mean_activation](head(features, recalled))
-        return Acted(mean, jnp.exp(log_std), memory, guess)
+        std = jnp.exp(log_std)
+        if self.config.exploration == "scheduled":
+            std = jax.lax.stop_gradient(std)
+        return Acted(_OUTPUTS[self.config.mean_activation](head(*features)), std, memory, guess)
 
 
-class _Critic(nn.Module):
-    """Value (`value`) of an observation: [B, O] -> [B], and the memory after."""
-
-    config: AlgoConfig
+class _Critic(_Network):
+    """Value (`value`) of an observation, and of the state if the critic sees it: [B]."""
 
     @nn.compact
     def __call__(
-        self,
-        observation: jax.Array,
-        memory: jax.Array | None = None,
-        begins: jax.Array | None = None,
-    ) -> tuple[jax.Array, jax.Array | None]:
-        features = _torso(self.config)(_hear(self.config, observation))
-        recalled = None
-        if memory is not None:
-            recalled, memory = _gru(self.config)(features, memory, begins)
-        return _Head(self.config, 1, name="value")(features, recalled)[..., 0], memory
+        self, observation: jax.Array, state: Any, memory: Any, begins: jax.Array | None = None
+    ) -> tuple[jax.Array, Any]:
+        seen = jnp.concatenate([observation, *jax.tree.leaves(state)], axis=-1)
+        features, memory = self._features(seen, memory, begins)
+        return _Head(self.config, 1, name="value")(*features)[..., 0], memory
 
 
-def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
+def _hear(config: AlgoConfig, hearing: Hearing | None, seen: jax.Array) -> jax.Array:
     """Sums neighbours up: applies one layer (`hearing`) to each neighbour and adds the results.
 
     This is the form of a function of a set: Zaheer et al. 2017, "Deep Sets", theorem 2. The order
     and the number of robots therefore do not matter.
 
     Args:
-      config: Gives the neighbours' place.
+      config: settings of the layer.
+      hearing: place of the neighbours.
       seen: [B, O], or [B, O + P] for a critic that sees the state too.
 
     Returns:
       [B, O - K W + E], or [B, O - K W + E + P] for a critic that sees the state too. E is the width
-      of the first hidden layer. Without neighbour messages, `seen` unchanged.
+      of the first hidden layer. Without neighbours, `seen` unchanged.
     """
-    hearing = config.hearing
     if hearing is None:
         return seen
     rows = seen[..., hearing.first : hearing.last]
@@ -182,303 +214,143 @@ def _hear(config: AlgoConfig, seen: jax.Array) -> jax.Array:
     return jnp.concatenate(parts, axis=-1)
 
 
-def _gru(config: AlgoConfig) -> Gru:
-    return Gru(
-        _memory_size(config),
-        uniform=config.initialization == "uniform",
-        kernels=config.memory_kernels,
-        name="memory",
-    )
-
-
-def _memory_size(config: AlgoConfig) -> int:
-    assert config.memory_size is not None  # the config has filled it in
-    return config.memory_size
-
-
-def _torso(config: AlgoConfig) -> nn.Module:
-    """Makes the layers before the heads: hidden layers, or an extension's network."""
-    return _Torso(config, name="torso") if config.torso is None else config.torso(name="torso")
-
-
 def _initializers(config: AlgoConfig, inputs: int, gain: float) -> tuple[Any, Any]:
     """Returns initialisers of kernel and bias of a layer; `gain` is for orthogonal kernels."""
     if config.initialization == "orthogonal":
         return nn.initializers.orthogonal(gain), nn.initializers.zeros_init()
     # `torch.nn.Linear.reset_parameters` does the same: the bound of both is 1 / sqrt(inputs).
-    uniform = functools.partial(ppo_memory.uniform, bound=1.0 / math.sqrt(inputs))
-    return uniform, uniform
+    within = functools.partial(uniform, bound=1.0 / math.sqrt(inputs))
+    return within, within
 
 
-def init_params(
-    key: jax.Array,
-    config: AlgoConfig,
-    observation_size: int,
-    action_size: int,
-    state_size: int = 0,
-) -> Params:
-    """Draws the parameters of a new actor and a new critic.
+class Networks(NamedTuple):
+    """Actor and critic, for one policy.
+
+    Attributes:
+      actor: Flax module of the actor.
+      critic: Flax module of the critic.
+    """
+
+    actor: _Actor
+    critic: _Critic
+
+    def init(self, key: jax.Array) -> Params:
+        """Draws the parameters of a new actor and a new critic.
+
+        Args:
+          key: random key, consumed.
+
+        Returns:
+          `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
+          {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
+          [out]. With `config.memory`, each network also has `{"memory": {"input": ..,
+          "recurrent": ..}}`. If the critic sees a state, the actor also has `{"guess": ..}`.
+        """
+        actor_key, critic_key = jax.random.split(key)
+        sizes, memory = self.actor.sizes, self.begin_memory(())
+        seen = jnp.zeros(sizes.observation)
+        state = jnp.zeros(sizes.state) if sizes.state else ()
+        return {
+            "actor": self.actor.init(actor_key, seen, memory.actor)["params"],
+            "critic": self.critic.init(critic_key, seen, state, memory.critic)["params"],
+        }
+
+    def begin_memory(self, shape: tuple[int, ...]) -> Recall:
+        """Returns the memory [*shape, H] of episodes that begin; () each without memory."""
+        config = self.actor.config
+        if config.memory == "none":
+            return NO_MEMORY
+        zero = jnp.zeros((*shape, config.memory_size), jnp.float32)
+        return Recall(zero, zero)
+
+    def act(
+        self, params: Params, observation: jax.Array, memory: Any, begins: jax.Array | None = None
+    ) -> Acted:
+        """Runs the actor.
+
+        Args:
+          params: result of `init`.
+          observation: [B, O], normalised, or [T, B, O] of sequences.
+          memory: [B, H], memory before; () without memory.
+          begins: [T, B] of sequences, whether an episode begins with the step; None for a single
+            step.
+
+        Returns:
+          The diagonal Gaussian of the action. Its mean is within -1..1 if the output is tanh,
+          otherwise unbounded. Its deviation does not depend on the observation, and has no gradient
+          if it is scheduled. Also the memory after, and a guess of the state that the critic sees.
+          The guess is not used for acting. Its error trains the memory to hold what a robot can
+          know about its surroundings (Mirowski et al. 2017, "Learning to Navigate in Complex
+          Environments", section 3).
+        """
+        self._check(params["actor"], observation)
+        output = self.actor.apply({"params": params["actor"]}, observation, memory, begins)
+        return cast("Acted", output)
+
+    def value(
+        self,
+        params: Params,
+        observation: jax.Array,
+        state: Any,
+        memory: Any,
+        begins: jax.Array | None = None,
+    ) -> tuple[jax.Array, Any]:
+        """Runs the critic.
+
+        Args:
+          params: result of `init`.
+          observation: [B, O] or [T, B, O], normalised.
+          state: [B, P] or [T, B, P], numbers of order 1; () if the critic sees no state.
+          memory: [B, H], memory before; () without memory.
+          begins: as in `act`.
+
+        Returns:
+          The expected discounted return, [B] or [T, B], and the memory after.
+        """
+        self._check(params["critic"], observation)
+        output = self.critic.apply({"params": params["critic"]}, observation, state, memory, begins)
+        return cast("tuple[jax.Array, Any]", output)
+
+    def _check(self, network: Params, observation: jax.Array) -> None:
+        """Checks an observation's size for the hidden layers; other networks check it alone."""
+        if self.actor.torso is None:
+            chex.assert_axis_dimension(observation, -1, self.actor.sizes.observation)
+
+
+def make(
+    config: AlgoConfig, sizes: Sizes, pieces: Sequence[Network] = (), kernels: Any = None
+) -> Networks:
+    """Makes actor and critic.
 
     Args:
-      key: Random key, consumed.
-      config: Layers, their initialisation, and the first standard deviation.
-      observation_size: O.
-      action_size: U.
-      state_size: P, how many numbers the critic sees in addition.
+      config: settings of the layers. It may name a network, or leave the choice to the extension.
+      sizes: what the policy sees and does.
+      pieces: networks of an extension.
+      kernels: what computes a memory on a GPU, as in `Gru`.
 
     Returns:
-      `{"actor": {"torso": {"hidden_0": ..}, "mean": .., "log_std": [U]}, "critic": {"torso":
-      {"hidden_0": ..}, "value": ..}}`. Each layer is a dict of `kernel` [in, out] and `bias`
-      [out]. With `config.memory`, each network also has `{"memory": {"input": .., "recurrent":
-      ..}}`. If the critic sees the state, the actor also has `{"guess": ..}`.
-    """
-    actor_key, critic_key = jax.random.split(key)
-    seen, judged = (jnp.zeros(n) for n in (observation_size, observation_size + state_size))
-    memory = begin_memory(config, ())
-    mine, theirs = (None, None) if memory is None else memory
-    return {
-        "actor": _Actor(config, action_size, state_size).init(actor_key, seen, mine)["params"],
-        "critic": _Critic(config).init(critic_key, judged, theirs)["params"],
-    }
-
-
-def begin_memory(config: AlgoConfig, shape: tuple[int, ...]) -> Recall | None:
-    """Returns the memory of episodes that begin.
-
-    Args:
-      config: Whether there is a memory, and its size.
-      shape: Leading axes.
-
-    Returns:
-      [*shape, H] each, or None without a memory.
-    """
-    if config.memory == "none":
-        return None
-    return ppo_memory.begin((*shape, _memory_size(config)))
-
-
-def action_distribution(
-    params: Params, config: AlgoConfig, observation: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Computes the diagonal Gaussian of the action, for a policy without memory.
-
-    Args:
-      params: Result of `init_params`.
-      config: The config that made `params`.
-      observation: [B, O], normalised.
-
-    Returns:
-      The mean [B, U], within -1..1 if the output is tanh, otherwise unbounded, and the standard
-      deviation [U]. The deviation does not depend on the observation. If it is scheduled, it has
-      no gradient.
-    """
-    return recall_action(params, config, observation, None)[:2]
-
-
-def value(params: Params, config: AlgoConfig, observation: jax.Array) -> jax.Array:
-    """Computes the value of an observation, for a critic without memory.
-
-    Args:
-      params: Result of `init_params`.
-      config: The config that made `params`.
-      observation: [B, O + P], normalised, as in `recall_value`.
-
-    Returns:
-      The expected discounted return, [B].
-    """
-    return recall_value(params, config, observation, None)[0]
-
-
-def recall_action(
-    params: Params,
-    config: AlgoConfig,
-    observation: jax.Array,
-    memory: jax.Array | None,
-    begins: jax.Array | None = None,
-) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Computes the diagonal Gaussian of the action, and the memory.
-
-    Args:
-      params: Result of `init_params`.
-      config: The config that made `params`.
-      observation: [B, O], normalised, or [T, B, O] of sequences.
-      memory: [B, H], memory of the actor before; None without memory.
-      begins: [T, B] of sequences, whether an episode begins with the step; None for a single
-        step.
-
-    Returns:
-      Mean and standard deviation as in `action_distribution`, and the memory [B, H] after.
-    """
-    return run_actor(params, config, observation, memory, begins)[:3]
-
-
-def run_actor(
-    params: Params,
-    config: AlgoConfig,
-    observation: jax.Array,
-    memory: jax.Array | None,
-    begins: jax.Array | None = None,
-) -> Acted:
-    """Runs the actor; arguments as in `recall_action`.
-
-    Returns:
-      What `recall_action` returns, and a guess of the state that the critic sees. The guess is not
-      used for acting. Its error trains the memory to hold what a robot can know about its
-      surroundings (Mirowski et al. 2017, "Learning to Navigate in Complex Environments", section
-      3).
-    """
-    mine = params["actor"]
-    _check_input(mine, observation, config)
-    sizes = mine["log_std"].shape[-1], mine["guess"]["bias"].shape[-1] if "guess" in mine else 0
-    output = _Actor(config, *sizes).apply({"params": mine}, observation, memory, begins)
-    acted = cast("Acted", output)
-    if config.exploration == "scheduled":
-        acted = acted._replace(std=jax.lax.stop_gradient(acted.std))
-    return acted
-
-
-def recall_value(
-    params: Params,
-    config: AlgoConfig,
-    observation: jax.Array,
-    memory: jax.Array | None,
-    begins: jax.Array | None = None,
-) -> tuple[jax.Array, jax.Array | None]:
-    """Computes the value of an observation, and the memory.
-
-    Args:
-      params: Result of `init_params`.
-      config: The config that made `params`.
-      observation: [B, O + P] or [T, B, O + P], normalised. It is the policy's observation, followed
-        by the state that the critic sees in addition, if any.
-      memory: [B, H], memory of the critic before; None without memory.
-      begins: As in `recall_action`.
-
-    Returns:
-      The value [B], or [T, B], and the memory [B, H] after.
-    """
-    _check_input(params["critic"], observation, config)
-    output = _Critic(config).apply({"params": params["critic"]}, observation, memory, begins)
-    return cast("tuple[jax.Array, jax.Array | None]", output)
-
-
-def critic_input(observation: jax.Array, state: jax.Array | None) -> jax.Array:
-    """Joins the critic's inputs.
-
-    Args:
-      observation: [B, O], normalised.
-      state: [B, P], numbers that the critic sees in addition; None if there are none.
-
-    Returns:
-      [B, O + P], for `recall_value`.
-    """
-    return observation if state is None else jnp.concatenate([observation, state], axis=-1)
-
-
-def beyond_range(mean: jax.Array) -> jax.Array:
-    """Computes how far a mean action lies beyond the range of commands.
-
-    Args:
-      mean: [B, U], -1..1 spans the commands.
-
-    Returns:
-      [B, U]: 0 within the range, negative below it, positive above it.
-    """
-    return mean - jnp.clip(mean, -1.0, 1.0)
-
-
-def log_prob(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
-    """Computes the log density of actions under a diagonal Gaussian.
-
-    Args:
-      mean: [B, U].
-      std: [U], above 0.
-      action: [B, U], as drawn, before any clipping.
-
-    Returns:
-      The log density summed over U, [B].
-    """
-    chex.assert_equal_shape([mean, action])
-    chex.assert_shape(std, mean.shape[-1:])
-    standardised = (action - mean) / std
-    log_density = -0.5 * standardised**2 - jnp.log(std) - 0.5 * math.log(2.0 * math.pi)
-    return jnp.sum(log_density, axis=-1)
-
-
-def entropy(std: jax.Array) -> jax.Array:
-    """Computes the differential entropy of a diagonal Gaussian.
-
-    Args:
-      std: [U], above 0.
-
-    Returns:
-      The entropy in nats, [].
-    """
-    chex.assert_rank(std, 1)
-    return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
-
-
-def _check_input(network: Params, observation: jax.Array, config: AlgoConfig) -> None:
-    """Checks an observation's size for the hidden layers; other networks check it themselves."""
-    first = network.get("torso", {}).get("hidden_0", {})
-    if "kernel" in first:
-        size = first["kernel"].shape[-2]
-        if config.hearing is not None:
-            size += config.hearing.last - config.hearing.first - config.hidden_sizes[0]
-        chex.assert_axis_dimension(observation, -1, size)
-
-
-def bind_hearing(config: AlgoConfig, observation_size: int, count: int, width: int) -> AlgoConfig:
-    """Adds the neighbours' place to a config: they are the last entries of an observation.
-
-    Args:
-      config: Settings of the learner.
-      observation_size: O.
-      count: K, how many neighbours a robot hears; 0: robots do not hear.
-      width: W, entries for each neighbour.
-
-    Returns:
-      The config with its `hearing`; unchanged if robots do not hear.
-    """
-    if not count:
-        return config
-    return replace(config, hearing=Hearing(observation_size - count * width, count, width))
-
-
-def bind(
-    config: AlgoConfig, networks: Sequence[Network], observation_size: int, state_size: int = 0
-) -> AlgoConfig:
-    """Adds the module that a config names to the config.
-
-    Args:
-      config: Names a network, or leaves the choice to the extension.
-      networks: Networks of an extension.
-      observation_size: O.
-      state_size: P, how many numbers the critic sees in addition.
-
-    Returns:
-      The config with the module as its `torso`; unchanged for `mlp`.
+      The networks.
 
     Raises:
-      ConfigError: The network is missing, or does not return features.
+      ConfigError: the network is missing, or does not return features.
     """
-    name = resolve(config, networks)
-    found = {piece.name: piece for piece in networks}
-    if name == "mlp":
-        return config
-    bound = replace(config, network=name, torso=found[name].function)
-    _check_torso(bound, observation_size)
-    if state_size:
-        _check_torso(bound, observation_size + state_size, " for a critic of the state")
-    return bound
+    name = resolve(config, pieces)
+    torso = {piece.name: piece.function for piece in pieces}.get(name)
+    if torso is not None:
+        _check_torso(torso, name, sizes.observation)
+        if sizes.state:
+            whose = f"{name} for a critic of the state"
+            _check_torso(torso, whose, sizes.observation + sizes.state)
+    parts = (config, sizes, torso, kernels)
+    return Networks(_Actor(*parts), _Critic(*parts))
 
 
-def _check_torso(config: AlgoConfig, observation_size: int, whose: str = "") -> None:
+def _check_torso(torso: Any, name: str, observation_size: int) -> None:
     """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
     seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
-    where = f"network {config.network}{whose}"
+    where = f"network {name}"
     with explained(f"{where} fails"):
-        made = config.torso()
+        made = torso()
         found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
     other = sorted(set(variables) - {"params"})
     if other:

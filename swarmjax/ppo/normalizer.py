@@ -14,6 +14,9 @@ from swarmjax.shards import ALONE, Shards
 
 # An observation that has hardly varied yet is magnified by at most 1 / this.
 MIN_STD = 1e-3
+# Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
+# continuous-action detail 7: bound of normalised observations.
+OBSERVATION_LIMIT = 10.0
 
 
 @struct.dataclass(kw_only=True)
@@ -104,16 +107,16 @@ def _add(total: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
     return found, (total - (found - taken)) + (change - taken)
 
 
-def normalize(normalizer: Normalizer, observation: jax.Array, limit: float) -> jax.Array:
+def normalize(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     """Shifts and scales observations to mean 0 and standard deviation 1.
 
     Args:
       normalizer: Moments so far.
       observation: [..., O].
-      limit: Bound of the result's magnitude.
 
     Returns:
-      The normalised observations, [..., O], within plus or minus `limit`.
+      The normalised observations, [..., O], within plus or minus 10.
     """
     chex.assert_axis_dimension(observation, -1, normalizer.mean.shape[-1])
-    return jnp.clip((observation - normalizer.mean) / normalizer.std, -limit, limit)
+    scaled = (observation - normalizer.mean) / normalizer.std
+    return jnp.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)

@@ -1,6 +1,6 @@
 """The optimiser, and the step that every way of computing a gradient ends with."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ import optax
 
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Metrics
-from swarmjax.ppo.networks import Params
+from swarmjax.ppo.networks import Networks, Params
 from swarmjax.shards import ALONE, Shards
 
 # The metrics of a step with kernels: those of `losses.ppo_loss` for a critic of the observation,
@@ -27,6 +27,25 @@ METRICS = (
 )
 
 Progress = tuple[Params, optax.OptState]
+
+
+class Learning(NamedTuple):
+    """What every way of computing an update uses.
+
+    Attributes:
+      config: settings of PPO.
+      networks: actor and critic.
+      optimizer: the optimiser that `make` made.
+      shards: how the samples are spread over devices.
+      side_by_side: how many learners a device trains at once.
+    """
+
+    config: AlgoConfig
+    networks: Networks
+    optimizer: optax.GradientTransformation
+    shards: Shards = ALONE
+    side_by_side: int = 1
+
 
 # The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well if the sum of their rates
 # over all gradient steps equalled that of 6,000 to 15,000 steps whose rates fall from 3e-4 to 0.
@@ -97,12 +116,7 @@ def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
 
 
 def take(
-    config: AlgoConfig,
-    updates: int,
-    progress: Progress,
-    found: tuple[Params, Metrics],
-    any_valid: jax.Array,
-    shards: Shards = ALONE,
+    learning: Learning, progress: Progress, found: tuple[Params, Metrics], any_valid: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Takes a step along a gradient, unless no sample is valid.
 
@@ -113,12 +127,10 @@ def take(
     would break the parameters. After some skipped steps it also takes a step that is not finite.
 
     Args:
-      config: Settings of the optimiser.
-      updates: The value given to `make`.
+      learning: The optimiser, and how the samples are spread over devices.
       progress: Parameters and the optimiser's state before.
       found: The gradient, and the metrics of its loss.
       any_valid: [], whether the gradient includes a valid sample.
-      shards: How the samples are spread over devices.
 
     Returns:
       Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
@@ -126,10 +138,10 @@ def take(
     """
     params, optimizer_state = progress
     # One sum for all: on several devices each sum takes tens of microseconds, whatever its size.
-    (gradient, metrics), devices = shards.sum((found, any_valid.astype(jnp.float32)))
+    (gradient, metrics), devices = learning.shards.sum((found, any_valid.astype(jnp.float32)))
     any_valid = devices > 0.0
     metrics["grad_norm"] = optax.tree.norm(gradient)
-    steps, stepped_state = make(config, updates).update(gradient, optimizer_state, params)
+    steps, stepped_state = learning.optimizer.update(gradient, optimizer_state, params)
     stepped = (optax.apply_updates(params, steps), stepped_state)
     finite = jnp.isfinite(metrics["grad_norm"]) & _is_finite(stepped)
     metrics = {name: jnp.where(finite, metric, 0.0) for name, metric in metrics.items()}

@@ -472,7 +472,7 @@ def _write_summary(run: Path, program: Built, tally: Tally) -> None:
         "impl": engine.impl,
         "solver": engine.solver,
         "stepped_by": engine.label,
-        "update_backend": program.backend,
+        "update_backend": program.ppo.backend,
         "device": provenance.device(),
         "versions": provenance.versions(),
         "commit": provenance.commit(),

@@ -8,7 +8,6 @@ import numpy as np
 
 from swarmjax import epuck, extension, policy_file, provenance
 from swarmjax.config import files, to_dict
-from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import checkpoint
@@ -77,7 +76,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "policy": trained.algo.policy,
             "learners": trained.learners,
             "activation": trained.algo.activation,
-            "observation": described | _history(trained) | {"limit": ppo.OBSERVATION_LIMIT},
+            "observation": described | _history(trained) | {"limit": normalizer.OBSERVATION_LIMIT},
             "action": {
                 "names": list(names),
                 "units": list(units),

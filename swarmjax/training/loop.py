@@ -16,8 +16,9 @@ from jax import Array
 from swarmjax.curriculum import cohorts
 from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum.engine import CurriculumState, Schedule
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo import batch as batches
+from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
@@ -71,10 +72,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
     curriculum = curricula.init(program.curriculum(schedule), schedule)
     starts = _draw(program, schedule, curriculum, level_key, waiting=1)
-    size, actions = program.world.observation_size, program.world.action_size
-    learners = jax.vmap(
-        lambda key: ppo.init(key, config.algo, size, actions, config.updates, program.state_size)
-    )(jax.random.split(learner_key, config.learners))
+    learners = jax.vmap(program.ppo.init)(jax.random.split(learner_key, config.learners))
     return TrainState(
         learners=learners,
         arenas=starts,
@@ -146,7 +144,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
-    batch = rollout.batch(trajectory, config.algo, shards, state.arenas.recall)
+    batch = rollout.batch(program, trajectory, state.arenas.recall, ended, config.learners)
     learners, learned = _learn(program, state.learners, batch, learn_key)
     curriculum = curricula.observe(
         program.curriculum(schedule),
@@ -154,11 +152,11 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         config.curriculum.success,
         state.curriculum,
         ended,
-        rollout.value_loss(batch, ended),
+        batches.value_loss(batch, ended.episodes > 0),
         state.update,
         shards,
     )
-    learners = promotion.carry_over(learners, config, state.curriculum, curriculum)
+    learners = promotion.carry_over(learners, program, state.curriculum, curriculum)
     before = state.curriculum.chosen
     metrics = {
         "update": state.update,
@@ -193,11 +191,7 @@ def _learn(
     """Updates all learners with the batch of a rollout; returns them and what PPO reports."""
     config = program.config
     explored = rollout.explore(program, learners, config.algo.rollout_length)
-    return jax.vmap(
-        lambda learner, b, k: ppo.update(
-            learner, config.algo, b, k, config.updates, program.backend, program.shards
-        )
-    )(explored, batch, jax.random.split(key, config.learners))
+    return jax.vmap(program.ppo.update)(explored, batch, jax.random.split(key, config.learners))
 
 
 def _draw(
@@ -210,8 +204,9 @@ def _draw(
         program.curriculum(schedule), curriculum, choose_key, (waiting, config.arenas)
     )
     following, cohort = jax.tree.map(partial(shards.local, axis=1), chosen)
+    memory = program.ppo.begin_memory((program.world.spacing.robots,))
     return rollout.draw_starts(
-        program.world, schedule.stages, following, cohort, key, shards, config.algo
+        program.world, schedule.stages, following, cohort, key, shards, memory
     )
 
 

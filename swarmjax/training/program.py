@@ -1,6 +1,6 @@
 """The compiled program of a run: everything that is fixed before the run starts."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 
@@ -9,8 +9,8 @@ from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum import levels
 from swarmjax.curriculum import stages as stage_modes
 from swarmjax.curriculum.engine import Curriculum, Schedule
-from swarmjax.ppo import dispatch, networks
-from swarmjax.ppo.dispatch import Backend
+from swarmjax.ppo.networks import Hearing, Sizes
+from swarmjax.ppo.ppo import PPO
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
@@ -30,19 +30,19 @@ class Program[C: ProgramConfig]:
     Attributes:
       config: its settings.
       world: the compiled environment.
-      backend: how learners compute their updates.
+      ppo: how the learners act and learn.
       by_robot: whether to report each episode robot by robot.
     """
 
     config: C
     world: World
-    backend: Backend = "autodiff"
+    ppo: PPO
     by_robot: bool = False
 
     @property
     def shards(self) -> Shards:
         """How the arenas are spread over devices."""
-        return Shards(self.config.arena_devices, self.config.stream_count)
+        return shards_of(self.config)
 
     @property
     def rows(self) -> int:
@@ -52,11 +52,6 @@ class Program[C: ProgramConfig]:
             most = min(most, episodes.rows_of_call(self.config))
         return min(self.config.updates, most)
 
-    @property
-    def state_size(self) -> int:
-        """Count of numbers that a critic sees in addition to the observation, P; 0 if none."""
-        return _state_size(self.config)
-
     def curriculum(self, schedule: Schedule) -> Curriculum:
         """Returns the curriculum with the numbers of a schedule."""
         options = self.config.curriculum
@@ -64,6 +59,11 @@ class Program[C: ProgramConfig]:
         if options.levels.mode == "random":
             return by_stage
         return levels.make(by_stage, schedule, options)
+
+
+def shards_of(config: ProgramConfig) -> Shards:
+    """Returns how the arenas of a seed are spread over devices."""
+    return Shards(config.arena_devices, config.stream_count)
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
@@ -80,19 +80,28 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
       ConfigError: Warp is required but not installed, the gradient's backend is not available, or a
         part of an extension does not fit.
     """
-    world, pieces = load_world(config), extension.load(config.extensions)
-    heard = config.task.neighbours
-    size = world.observation_size
-    algo = networks.bind(config.algo, pieces.networks, size, _state_size(config))
-    algo = dispatch.bind_memory(networks.bind_hearing(algo, size, heard.count, heard.width))
-    algo = replace(algo, side_by_side=side_by_side(config) * config.learners)
-    config = replace(config, algo=algo)
-    backend = dispatch.resolve(algo, size, world.action_size)
-    return Program(config, world, backend, by_robot), schedule(config)
+    world = load_world(config)
+    return Program(config, world, _load_ppo(config, world), by_robot), schedule(config)
 
 
-def _state_size(config: ProgramConfig) -> int:
-    return surroundings.SIZE if config.algo.critic == "state" else 0
+def _load_ppo(config: ProgramConfig, world: World) -> PPO:
+    """Builds PPO for the observations and actions of an environment."""
+    size, heard = world.observation_size, config.task.neighbours
+    first = size - heard.count * heard.width
+    sizes = Sizes(
+        observation=size,
+        action=world.action_size,
+        state=surroundings.SIZE if config.algo.critic == "state" else 0,
+        hearing=Hearing(first, heard.count, heard.width) if heard.count else None,
+    )
+    return PPO.make(
+        config.algo,
+        sizes,
+        config.updates,
+        pieces=extension.load(config.extensions).networks,
+        shards=shards_of(config),
+        side_by_side=side_by_side(config) * config.learners,
+    )
 
 
 def load_world(config: ProgramConfig) -> World:

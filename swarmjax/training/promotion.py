@@ -8,13 +8,12 @@ import optax
 from jax import Array
 
 from swarmjax.curriculum.engine import BY_BUDGET, BY_THRESHOLD, CurriculumState
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.learner import LearnerState
-from swarmjax.training.config import ProgramConfig
+from swarmjax.ppo.ppo import LearnerState
+from swarmjax.training.program import Program
 
 
 def carry_over(
-    learners: LearnerState, config: ProgramConfig, before: CurriculumState, after: CurriculumState
+    learners: LearnerState, program: Program, before: CurriculumState, after: CurriculumState
 ) -> LearnerState:
     """Prepares the learners for the stage that begins with a promotion.
 
@@ -25,20 +24,20 @@ def carry_over(
 
     Args:
       learners: [L].
-      config: settings of the run.
+      program: the compiled program.
       before: state of the curriculum before the update.
       after: and after it. Without a promotion, the learners stay unchanged.
 
     Returns:
       The learners, [L].
     """
-    options, carried = config.curriculum, learners
-    if config.learners > 1:
+    options, carried = program.config.curriculum, learners
+    if program.config.learners > 1:
         carried = _copied(carried, before.met, after.met)
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
     if options.exploration == "reset":
-        carried = ppo.explore_anew(carried, config.algo)
+        carried = program.ppo.explore_anew(carried)
     if carried is learners:
         return learners
     reason = after.chosen.reason

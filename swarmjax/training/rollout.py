@@ -15,12 +15,9 @@ from jax import Array
 
 from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.engine import Next
-from swarmjax.ppo import gae, monte_carlo
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch, LearnerState
-from swarmjax.ppo.memory import Recall
-from swarmjax.ppo.networks import begin_memory
+from swarmjax.ppo.batch import Batch, Trajectory
+from swarmjax.ppo.memory import NO_MEMORY, Recall
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, extended, level
@@ -38,46 +35,15 @@ class Arena(EnvState):
     Attributes:
       stage: [] index of the stage on which the episode began, int32.
       cohort: [] the curriculum's cohort in which the episode began, int32.
-      recall: [R, H] memory of each robot's actor and critic before the observation; None without a
+      recall: [R, H] memory of each robot's actor and critic before the observation; () each without
         memory.
       seed: [] seed of the episode's level, uint32; None if the curriculum chooses no levels.
     """
 
     stage: Array
     cohort: Array
-    recall: Recall | None = None
+    recall: Recall = NO_MEMORY
     seed: Array | None = None
-
-
-class Trajectory(NamedTuple):
-    """The learners' observations and actions and their results, [T, L, A, N, ...].
-
-    Attributes:
-      observation: [.., O], raw.
-      action: [.., U].
-      log_prob: of the action.
-      value: of the observation.
-      next_value: value of the observation after the step, before any reset.
-      reward: of the step.
-      terminated: whether the robot arrived in this step; with `task.arrival=hold`, whether all
-        robots were on their targets at once.
-      truncated: whether the time ran out for the robot.
-      valid: whether to learn from the transition.
-      over: whether the episode ended with the step; None without a memory.
-      state: [.., P], what the critic sees in addition to the observation; None if nothing.
-    """
-
-    observation: Array
-    action: Array
-    log_prob: Array
-    value: Array
-    next_value: Array
-    reward: Array
-    terminated: Array
-    truncated: Array
-    valid: Array
-    over: Array | None = None
-    state: Array | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -116,7 +82,7 @@ def draw_starts(
     cohort: Array,
     key: Array,
     shards: Shards = ALONE,
-    config: AlgoConfig | None = None,
+    memory: Recall = NO_MEMORY,
 ) -> Arena:
     """Draws the levels of episodes that wait until their arena is free.
 
@@ -131,12 +97,11 @@ def draw_starts(
       cohort: [W, A] or [] cohort for which each episode counts, int32.
       key: random key for the new levels, consumed.
       shards: how the arenas are spread over devices; A counts those of this device.
-      config: whether robots have a memory; None: they have none.
+      memory: [R, H] memory of the robots of an arena as an episode begins.
 
     Returns:
       [W A] waiting episodes, packed.
     """
-    memory = None if config is None else begin_memory(config, (world.spacing.robots,))
     waiting, arenas = following.stage.shape
     count = level.uniform_count(world.spacing)
     stages = jax.tree.map(jnp.asarray, stages)
@@ -175,14 +140,13 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    config = program.config.algo
     waits = _Waiting(starts, _judge(program, learners, starts))
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
     carry = (arenas, _judge(program, learners, arenas), begun)
-    steps = config.rollout_length
+    steps = program.config.algo.rollout_length
     keys = jax.random.split(key, steps)
     carry, (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
     arenas = carry[0]
@@ -190,112 +154,30 @@ def collect(
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
 
-def explore(program: Program, learners: LearnerState, steps: Array | int) -> LearnerState:
-    """Moves the learners [L] along the schedule of exploration, by `steps` of every arena."""
-    config, arenas = program.config.algo, program.config.arenas
-    return jax.vmap(lambda learner: ppo.explore(learner, config, steps * arenas))(learners)
-
-
 def batch(
-    trajectory: Trajectory,
-    config: AlgoConfig,
-    shards: Shards = ALONE,
-    memory: Recall | None = None,
+    program: Program, trajectory: Trajectory, memory: Recall, ended: Ended, learners: int
 ) -> Batch:
-    """Turns a rollout into batches for the learners.
+    """Turns a rollout into the samples of an update.
 
     Args:
+      program: the compiled program.
       trajectory: [T, L, A, N, ...].
-      config: defines the return.
-      shards: how the arenas are spread over devices.
-      memory: [A, R, H] memory of the arenas before the rollout; None without a memory.
+      memory: [A, R, H] memory of the arenas before the rollout.
+      ended: [T, A] episodes that ended in it.
+      learners: L.
 
     Returns:
       [L] batches, each of A groups with T * N samples.
     """
-    advantages, returns = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.advantage](
-        trajectory, config, shards
-    )
-
-    def group(x: Array) -> Array:
-        x = jnp.moveaxis(x, 0, 2)
-        return x.reshape(*x.shape[:2], -1, *x.shape[4:])
-
-    found = Batch(
-        observation=group(trajectory.observation),
-        action=group(trajectory.action),
-        log_prob=group(trajectory.log_prob),
-        advantage=group(advantages),
-        return_=group(returns),
-        valid=group(trajectory.valid),
-        state=None if trajectory.state is None else group(trajectory.state),
-    )
-    over = trajectory.over
-    if memory is None or over is None:
-        return found
-    first = jax.tree.map(lambda x: to_learners(x, over.shape[1]), memory)
-    begins = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
-    return replace(found, memory=first, begins=group(begins))
+    first = jax.tree.map(lambda x: to_learners(x, learners), memory)
+    each = jax.vmap(program.ppo.batch, in_axes=(1, 0, None))
+    return each(trajectory, first, ended.episodes > 0)
 
 
-def value_loss(batch: Batch, ended: Ended) -> Array:
-    """Computes the positive value loss of each episode, over its transitions in a rollout.
-
-    Args:
-      batch: [L] batches, each of A groups with T N samples.
-      ended: [T, A] episodes that ended.
-
-    Returns:
-      [T, A] mean of max(advantage, 0) over the transitions since the last end of an episode.
-    """
-    steps = ended.episodes.shape[0]
-
-    def by_step(x: Array) -> Array:
-        return jnp.sum(x.reshape(*x.shape[:2], steps, -1), axis=(0, 3)).T
-
-    positive = by_step(jnp.where(batch.valid, jnp.maximum(batch.advantage, 0.0), 0.0))
-    valid = by_step(batch.valid.astype(jnp.float32))
-
-    def step(sums: tuple[Array, Array], now: tuple[Array, Array, Array]) -> Any:
-        total, count = sums[0] + now[0], sums[1] + now[1]
-        going_on = jnp.where(now[2], 0.0, total), jnp.where(now[2], 0.0, count)
-        return going_on, total / jnp.maximum(count, 1.0)
-
-    none = jnp.zeros_like(positive[0])
-    return jax.lax.scan(step, (none, none), (positive, valid, ended.episodes > 0))[1]
-
-
-def _bootstrapped(trajectory: Trajectory, config: AlgoConfig, _: Shards) -> tuple[Array, Array]:
-    """Returns the advantages and returns of generalised advantage estimation."""
-    assert config.gae_lambda is not None  # the config has filled it in
-    terminated = trajectory.terminated
-    if config.time_out == "terminal":
-        terminated = terminated | _timed_out(trajectory)
-    return gae.generalized_advantages(
-        trajectory.reward,
-        trajectory.value,
-        trajectory.next_value,
-        terminated,
-        trajectory.truncated,
-        discount=config.discount,
-        gae_lambda=config.gae_lambda,
-    )
-
-
-def _monte_carlo(trajectory: Trajectory, config: AlgoConfig, shards: Shards) -> tuple[Array, Array]:
-    """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
-    boundary = trajectory.terminated | trajectory.truncated
-    if config.time_out == "leak":
-        boundary = boundary & ~_timed_out(trajectory)
-    returns = monte_carlo.monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
-    normalize = functools.partial(monte_carlo.normalize, shards=shards)
-    normal = jax.vmap(normalize, in_axes=1, out_axes=1)(returns, trajectory.valid)
-    return normal - trajectory.value, normal
-
-
-def _timed_out(trajectory: Trajectory) -> Array:
-    """Tells where the step limit ended episodes. Steps whose physics broke are not valid."""
-    return trajectory.truncated & trajectory.valid
+def explore(program: Program, learners: LearnerState, steps: Array | int) -> LearnerState:
+    """Moves the learners [L] along the schedule of exploration, by `steps` of every arena."""
+    arenas = program.config.arenas
+    return jax.vmap(lambda learner: program.ppo.explore(learner, steps * arenas))(learners)
 
 
 class _Judged(NamedTuple):
@@ -303,13 +185,13 @@ class _Judged(NamedTuple):
 
     Attributes:
       value: value of the observation.
-      memory: [.., H] memory of the critic afterwards; None without a memory.
-      state: [.., P], what the critic sees in addition to the observation; None if nothing.
+      memory: [.., H] memory of the critic afterwards; () without memory.
+      state: [.., P], what the critic sees in addition to the observation; () if nothing.
     """
 
     value: Array
-    memory: Array | None
-    state: Array | None
+    memory: Any
+    state: Any
 
 
 class _Waiting(NamedTuple):
@@ -350,12 +232,12 @@ def _step(
     count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = _noise(program.shards, key, (*mine.shape[:-1], program.world.action_size))
-    config = program.config.algo
     acting = explore(program, learners, number)
-    action, log_prob, memory = _act(config, acting, mine, noise, arenas.recall)
+    memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.actor)
+    action, log_prob, memory = jax.vmap(program.ppo.act)(acting, mine, noise, memory)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
-    if memory is not None and judged.memory is not None:
-        arenas = replace(arenas, recall=Recall(memory, to_arenas(judged.memory)))
+    recall = jax.tree.map(to_arenas, Recall(memory, judged.memory))
+    arenas = replace(arenas, recall=recall)
     reached = _judge(program, learners, arenas)
     ended = _ended(arenas, came, by_robot=program.by_robot)
     starts, first = _next(waits, begun)
@@ -371,27 +253,10 @@ def _step(
         terminated=to_learners(came.terminated, count),
         truncated=to_learners(came.truncated, count),
         valid=to_learners(came.valid, count),
-        over=None if memory is None else over,
         state=judged.state,
     )
     carry = (arenas, _pick(over, first, reached), begun + came.done)
     return carry, (transition, _to_counts(ended))
-
-
-def _act(
-    config: AlgoConfig,
-    learners: LearnerState,
-    seen: Array,
-    noise: Array,
-    memory: Recall | None,
-) -> tuple[Array, Array, Array | None]:
-    """Draws actions [L, A, N, U]; returns them, their log density and the memory [A, R, H]."""
-    count = seen.shape[0]
-    mine = None if memory is None else to_learners(memory.actor, count)
-    action, log_prob, after = jax.vmap(
-        lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)
-    )(learners, seen, noise, mine)
-    return action, log_prob, None if after is None else to_arenas(after)
 
 
 def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
@@ -415,15 +280,13 @@ def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
 
 def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
     """Lets critics judge the current observations of arenas [A]."""
-    config, count = program.config.algo, jax.tree.leaves(learners)[0].shape[0]
-    memory = None if arenas.recall is None else to_learners(arenas.recall.critic, count)
-    state = None
-    if config.critic == "state":
+    count, state = jax.tree.leaves(learners)[0].shape[0], ()
+    memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.critic)
+    if program.ppo.sizes.state:
         around = jax.vmap(functools.partial(env.look_around, program.world))(arenas)
         state = to_learners(around, count)
-    value, after = jax.vmap(lambda learner, *seen: ppo.recall_values(learner, config, *seen))(
-        learners, to_learners(arenas.observation, count), memory, state
-    )
+    seen = to_learners(arenas.observation, count)
+    value, after = jax.vmap(program.ppo.value)(learners, seen, state, memory)
     return _Judged(value, after, state)
 
 

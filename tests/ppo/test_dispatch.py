@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import jax
+import learners
 import pytest
 
 from swarmjax.config import ConfigError
@@ -14,6 +15,11 @@ OBSERVATION, ACTION = 10, 2
 
 def _on(monkeypatch: pytest.MonkeyPatch, **device: str) -> None:
     monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(**device)])
+
+
+def _resolve(config: AlgoConfig, observation: int = OBSERVATION) -> str:
+    nets = learners.nets(config, observation, ACTION)
+    return dispatch.resolve(config, nets, nets.actor.sizes)
 
 
 @pytest.mark.parametrize(
@@ -30,79 +36,76 @@ def test_auto_is_fused_on_an_nvidia_gpu_where_the_layers_fit(
     device: dict[str, str], choice: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _on(monkeypatch, **device)
-    assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == choice
-    assert (
-        dispatch.resolve(AlgoConfig(update_backend="autodiff"), OBSERVATION, ACTION) == "autodiff"
-    )
-    assert dispatch.resolve(AlgoConfig(hidden_sizes=(8,)), OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(AlgoConfig()) == choice
+    assert _resolve(AlgoConfig(update_backend="autodiff")) == "autodiff"
+    assert _resolve(AlgoConfig(hidden_sizes=(8,))) == "autodiff"
 
 
 def test_a_whole_batch_is_taken_in_blocks_on_a_cpu_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = AlgoConfig(num_minibatches=1)
-    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "blocks"
-    assert dispatch.resolve(AlgoConfig(num_minibatches=2), OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(whole) == "blocks"
+    assert _resolve(AlgoConfig(num_minibatches=2)) == "autodiff"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(whole) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
-    assert dispatch.resolve(whole, OBSERVATION, ACTION) == "fused"
+    assert _resolve(whole) == "fused"
 
 
 def test_full_precision_is_left_to_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
     _on(monkeypatch, compute_capability="9.0")
     with jax.default_matmul_precision("highest"):
-        assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "autodiff"
-        assert dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION) == "fused"
+        assert _resolve(AlgoConfig()) == "autodiff"
+        assert _resolve(AlgoConfig(update_backend="fused")) == "fused"
     with jax.default_matmul_precision("tensorfloat32"):
-        assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
+        assert _resolve(AlgoConfig()) == "fused"
 
 
 def test_fused_is_refused_where_it_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError) as no_gpu:
-        dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION)
+        _resolve(AlgoConfig(update_backend="fused"))
     assert str(no_gpu.value) == (
         "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability 8 or "
         "more: give auto or autodiff."
     )
     _on(monkeypatch, compute_capability="9.0")
-    assert dispatch.resolve(AlgoConfig(update_backend="fused"), OBSERVATION, ACTION) == "fused"
+    assert _resolve(AlgoConfig(update_backend="fused")) == "fused"
     with pytest.raises(ConfigError) as unfit:
-        dispatch.resolve(
-            AlgoConfig(update_backend="fused", hidden_sizes=(48, 64)), OBSERVATION, ACTION
-        )
+        _resolve(AlgoConfig(update_backend="fused", hidden_sizes=(48, 64)))
     assert str(unfit.value) == (
         "algo.update_backend is fused, but algo.hidden_sizes is [48,64], which the kernels do not "
         "support: give two layers of 16, 32 or 64, or algo.update_backend=auto."
     )
 
 
-def test_a_history_that_does_not_fit_the_chip_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_observation_too_large_for_the_chip_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _on(monkeypatch, compute_capability="9.0")
     config = AlgoConfig(update_backend="fused")
-    # The kernels take at most 128 numbers: 12 observations of 10 numbers each, after padding.
-    assert dispatch.resolve(AlgoConfig(), 13 * OBSERVATION, ACTION) != "fused"
+    # The kernels take at most 128 numbers, after padding.
+    assert _resolve(AlgoConfig(), 13 * OBSERVATION) != "fused"
     with pytest.raises(ConfigError) as unfit:
-        dispatch.resolve(config, 13 * OBSERVATION, ACTION)
+        _resolve(config, 13 * OBSERVATION)
     assert str(unfit.value) == (
         "algo.update_backend is fused, but 130 numbers are observed, more than the kernels "
-        "support: give a smaller task.history, fewer task.observations, or "
-        "algo.update_backend=auto."
+        "support: give fewer task.observations, or algo.update_backend=auto."
     )
 
 
 def test_a_critic_that_sees_the_state_has_autodiff(monkeypatch: pytest.MonkeyPatch) -> None:
     _on(monkeypatch, compute_capability="9.0")
-    assert dispatch.resolve(AlgoConfig(), OBSERVATION, ACTION) == "fused"
-    assert dispatch.resolve(AlgoConfig(critic="state"), OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(AlgoConfig()) == "fused"
+    assert _resolve(AlgoConfig(critic="state")) == "autodiff"
 
 
 def test_a_memory_is_trained_in_sequences_on_any_device(monkeypatch: pytest.MonkeyPatch) -> None:
     config = AlgoConfig(memory="gru", num_minibatches=1)
     asked = AlgoConfig(memory="gru", update_backend="autodiff")
-    assert dispatch.resolve(config, OBSERVATION, ACTION) == "sequences"
-    assert dispatch.resolve(asked, OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(config) == "sequences"
+    assert _resolve(asked) == "autodiff"
     _on(monkeypatch, compute_capability="9.0")
-    assert dispatch.resolve(config, OBSERVATION, ACTION) == "sequences"
-    assert dispatch.resolve(asked, OBSERVATION, ACTION) == "autodiff"
+    assert _resolve(config) == "sequences"
+    assert _resolve(asked) == "autodiff"
 
 
 def test_each_faster_way_has_its_code() -> None:

@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 
-from swarmjax.ppo import exploration, learner
+from swarmjax.ppo import exploration
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import LearnerState
 
 SCHEDULED = AlgoConfig(
     hidden_sizes=(8,),
@@ -37,40 +40,44 @@ def test_each_level_holds_for_an_interval_and_the_last_for_ever() -> None:
     np.testing.assert_array_equal(found, expected)
 
 
-def _std(state: learner.LearnerState) -> np.ndarray:
+PPO_ = learners.ppo(SCHEDULED, Sizes(3, 2), 5, "blocks")
+
+
+def _std(state: LearnerState) -> np.ndarray:
     return np.exp(np.asarray(state.params["actor"]["log_std"]))
 
 
 def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
-    state = learner.init(jax.random.key(0), SCHEDULED, 3, 2, 5)
+    state = PPO_.init(jax.random.key(0))
     for steps, explored, std in ((100, 100, 0.6), (1, 101, 0.55), (99, 200, 0.55), (60, 260, 0.5)):
-        state = learner.explore(state, SCHEDULED, steps)
+        state = PPO_.explore(state, steps)
         assert state.explored == explored
         # float32 rounding of a logarithm and an exponential.
         np.testing.assert_allclose(_std(state), [std, std], rtol=1e-6)
-    begun = learner.explore_anew(state, SCHEDULED)
+    begun = PPO_.explore_anew(state)
     assert begun.explored == 0
     np.testing.assert_allclose(_std(begun), [0.6, 0.6], rtol=1e-6)
 
 
 def test_the_count_of_steps_does_not_wrap() -> None:
-    state = learner.init(jax.random.key(0), SCHEDULED, 3, 2, 5)
+    state = PPO_.init(jax.random.key(0))
     state = replace(state, explored=jnp.int32(2**31 - 50))
     for _ in range(2):
-        state = learner.explore(state, SCHEDULED, 100)
+        state = PPO_.explore(state, 100)
         assert state.explored == 2**31 - 1
         np.testing.assert_allclose(_std(state), [0.1, 0.1], rtol=1e-6)  # float32, as above
 
 
 def test_without_a_schedule_a_learner_stays_as_it_is() -> None:
     learned = AlgoConfig(hidden_sizes=(8,), num_minibatches=1)
-    state = learner.init(jax.random.key(0), learned, 3, 2, 5)
+    made = learners.ppo(learned, Sizes(3, 2), 5)
+    state = made.init(jax.random.key(0))
     assert state.explored is None
-    assert learner.explore(state, learned, 10) is state
+    assert made.explore(state, 10) is state
 
 
 def test_an_update_leaves_a_scheduled_deviation_alone() -> None:
-    state = learner.explore(learner.init(jax.random.key(0), SCHEDULED, 3, 2, 5), SCHEDULED, 150)
+    state = PPO_.explore(PPO_.init(jax.random.key(0)), 150)
     observation, action = jax.random.normal(jax.random.key(1), (2, 4, 6, 3))
     action = action[..., :2]
     batch = Batch(
@@ -81,7 +88,7 @@ def test_an_update_leaves_a_scheduled_deviation_alone() -> None:
         return_=observation[..., 1],
         valid=jnp.ones((4, 6), bool),
     )
-    updated, metrics = learner.update(state, SCHEDULED, batch, jax.random.key(2), 5, "blocks")
+    updated, metrics = PPO_.update(state, batch, jax.random.key(2))
     np.testing.assert_array_equal(
         updated.params["actor"]["log_std"], state.params["actor"]["log_std"]
     )

@@ -9,12 +9,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import dispatch, learner, networks
+from swarmjax.ppo import dispatch
+from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.networks import Hearing, Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 
 OWN, COUNT, WIDTH, STATE = 3, 4, 5, 2
 SIZE = OWN + COUNT * WIDTH
@@ -27,9 +31,14 @@ KINDS = {
 }
 
 
-def _learner(config: AlgoConfig, actions: int = 3, state: int = 0) -> LearnerState:
+def _ppo(config: AlgoConfig, state: int = 0) -> PPO:
+    sizes = Sizes(SIZE, 3, state, Hearing(OWN, COUNT, WIDTH))
+    return learners.ppo(config, sizes, backend="autodiff")
+
+
+def _learner(ppo: PPO) -> LearnerState:
     """Returns a learner whose weights have noise added, since new output layers are near 0."""
-    made = learner.init(jax.random.key(0), config, SIZE, actions, 10, state)
+    made = ppo.init(jax.random.key(0))
     leaves, tree = jax.tree.flatten(made.params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     drawn = [x + 0.3 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
@@ -49,14 +58,13 @@ def _seen(there: tuple[int, ...] = (1, 1, 1, 0)) -> tuple[np.ndarray, np.ndarray
 
 def _think(kind: str, own: np.ndarray, rows: np.ndarray) -> tuple[Any, Any]:
     """Returns the action and the value of one observation."""
-    config = networks.bind_hearing(AlgoConfig(hidden_sizes=(8, 6), **KINDS[kind]), SIZE, 4, WIDTH)
-    state = jnp.array([0.5, -0.5]) if config.critic == "state" else None
-    mine = _learner(config, state=0 if state is None else STATE)
-    memory = networks.begin_memory(config, ())
-    actor, critic = (None, None) if memory is None else memory
+    config = AlgoConfig(hidden_sizes=(8, 6), **KINDS[kind])
+    sees = config.critic == "state"
+    ppo = _ppo(config, STATE if sees else 0)
+    mine, memory = _learner(ppo), ppo.begin_memory(())
     seen = jnp.concatenate([jnp.asarray(own), jnp.asarray(rows).ravel()])
-    action, _ = learner.recall_mode(mine, config, seen, actor)
-    value, _ = learner.recall_values(mine, config, seen, critic, state)
+    action, _, _ = ppo.act(mine, seen, jnp.zeros(3), memory.actor)
+    value, _ = ppo.value(mine, seen, jnp.array([0.5, -0.5]) if sees else (), memory.critic)
     return np.asarray(action), np.asarray(value)
 
 
@@ -78,8 +86,7 @@ def test_a_neighbour_more_is_noticed(kind: str) -> None:
 
 
 def test_what_is_heard_is_the_sum_of_one_layer_of_each() -> None:
-    config = networks.bind_hearing(PLAIN, SIZE, COUNT, WIDTH)
-    mine = jax.tree.map(np.asarray, _learner(config).params["actor"])
+    mine = jax.tree.map(np.asarray, _learner(_ppo(PLAIN)).params["actor"])
     own, rows = _seen()
     each = np.tanh(rows @ mine["hearing"]["kernel"] + mine["hearing"]["bias"])
     x = np.concatenate([own, each[:3].sum(axis=0)])  # the fourth neighbour is absent
@@ -90,14 +97,12 @@ def test_what_is_heard_is_the_sum_of_one_layer_of_each() -> None:
 
 
 def test_a_policy_that_does_not_hear_has_the_weights_that_it_had() -> None:
-    assert networks.bind_hearing(PLAIN, SIZE, 0, 0) is PLAIN
-    assert "hearing" not in learner.init(jax.random.key(0), PLAIN, SIZE, 2, 1).params["actor"]
+    made = learners.ppo(PLAIN, Sizes(SIZE, 2)).init(jax.random.key(0))
+    assert "hearing" not in made.params["actor"]
 
 
 def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
-    config = networks.bind_hearing(
-        AlgoConfig(hidden_sizes=(8, 6), num_minibatches=1), SIZE, COUNT, WIDTH
-    )
+    ppo = _ppo(AlgoConfig(hidden_sizes=(8, 6), num_minibatches=1))
     draw = np.random.default_rng(0)
     shape = (4, 8)
     batch = Batch(
@@ -108,7 +113,7 @@ def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
         return_=jnp.zeros(shape),
         valid=jnp.ones(shape, bool),
     )
-    after, _ = learner.update(_learner(config), config, batch, jax.random.key(0), 10)
+    after, _ = ppo.update(_learner(ppo), batch, jax.random.key(0))
     assert (np.asarray(after.normalizer.mean)[:OWN] > 1.0).all()
     np.testing.assert_array_equal(after.normalizer.mean[OWN:], 0.0)
     np.testing.assert_array_equal(after.normalizer.variance[OWN:], 1.0)
@@ -145,13 +150,13 @@ def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
 
 
 def _live(
-    config: AlgoConfig, deaf: bool, state: LearnerState, carry: Any, key: jax.Array
+    ppo: PPO, deaf: bool, state: LearnerState, carry: Any, key: jax.Array
 ) -> tuple[Any, Any]:
     """Runs one control step of all pairs; the numbers stay fixed in an episode of STEPS steps."""
     draw, said, clock = carry
     noise, fresh = jax.random.split(key)
     seen = _look(draw, said)
-    action, log_prob = learner.act(state, config, seen, jax.random.normal(noise, (PAIRS, 2, 2)))
+    action, log_prob, _ = ppo.act(state, seen, jax.random.normal(noise, (PAIRS, 2, 2)))
     heard = jnp.where(deaf, 0.0, jnp.clip(action[..., 1], -1.0, 1.0))
     # The first step of an episode gives no reward, since no message has been sent yet.
     paid = -jnp.abs(action[..., 0] - draw[:, ::-1]) * (clock > 0)
@@ -162,7 +167,7 @@ def _live(
         jnp.where(ends, 0.0, heard),
         jnp.where(ends, 0, clock + 1),
     )
-    value = learner.values(state, config, seen)
+    value, _ = ppo.value(state, seen)
     # A message earns a reward only within its episode, which ends with `ends` for both robots.
     return after, (seen, action, log_prob, paid, value, jnp.broadcast_to(ends, paid.shape))
 
@@ -172,13 +177,13 @@ def _shared(paid: jax.Array) -> jax.Array:
     return paid + paid[..., ::-1]
 
 
-def _iterate(config: AlgoConfig, deaf: bool, carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+def _iterate(ppo: PPO, deaf: bool, carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
     from swarmjax.ppo.gae import generalized_advantages
 
-    state, world = carry
+    (state, world), config = carry, ppo.config
     roll, learn = jax.random.split(key)
     keys = jax.random.split(roll, config.rollout_length)
-    live = functools.partial(_live, config, deaf, state)
+    live = functools.partial(_live, ppo, deaf, state)
     world, (seen, action, log_prob, paid, value, ends) = jax.lax.scan(live, world, keys)
     following = jnp.concatenate([value[1:], value[-1:]])
     none = jnp.zeros_like(ends)
@@ -198,20 +203,21 @@ def _iterate(config: AlgoConfig, deaf: bool, carry: Any, key: jax.Array) -> tupl
         return_=group(return_),
         valid=jnp.ones((PAIRS, config.rollout_length * 2), bool),
     )
-    state, _ = learner.update(state, config, batch, learn, UPDATES)
+    state, _ = ppo.update(state, batch, learn)
     return (state, world), paid.sum() / (paid != 0).sum()
 
 
 def _earned(deaf: bool) -> float:
     """Returns the mean reward per step at the end of training: 0 at best, -1 by chance."""
-    config = networks.bind_hearing(PROBE, 1 + ROW, 1, ROW)
-    state = learner.init(jax.random.key(0), config, 1 + ROW, 2, UPDATES)
+    sizes = Sizes(1 + ROW, 2, hearing=Hearing(1, 1, ROW))
+    ppo = learners.ppo(PROBE, sizes, UPDATES, "autodiff")
+    state = ppo.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), UPDATES)
     draw = jax.random.rademacher(jax.random.key(2), (PAIRS, 2), jnp.float32)
     world = (draw, jnp.zeros((PAIRS, 2)), jnp.zeros((), jnp.int32))
     _, earned = jax.jit(
         lambda state, world: jax.lax.scan(
-            functools.partial(_iterate, config, deaf), (state, world), keys
+            functools.partial(_iterate, ppo, deaf), (state, world), keys
         )
     )(state, world)
     return float(earned[-10:].mean())

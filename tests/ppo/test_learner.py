@@ -5,32 +5,38 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import dispatch, learner, losses, networks, optimizer
+from swarmjax.ppo import losses, networks, optimizer, ppo
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 
 G, N, OBSERVATION, U, UPDATES = 8, 6, 3, 2, 5
 CONFIG = AlgoConfig(hidden_sizes=(8,), epochs=3, num_minibatches=4, entropy_cost=0.01)
 ONE_STEP = AlgoConfig(hidden_sizes=(8,), epochs=1, num_minibatches=1)
 
 
+def _ppo(config: AlgoConfig = CONFIG) -> PPO:
+    return learners.ppo(config, Sizes(OBSERVATION, U), UPDATES)
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def _update(
     state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
 ) -> tuple[LearnerState, losses.Metrics]:
-    backend = dispatch.resolve(config, OBSERVATION, U)  # as in a run
-    return learner.update(state, config, batch, key, UPDATES, backend)
+    return _ppo(config).update(state, batch, key)
 
 
 def _batch(state: LearnerState, seed: int = 0, config: AlgoConfig = CONFIG) -> Batch:
     observation_key, noise_key, target_key, valid_key = jax.random.split(jax.random.key(seed), 4)
     observation = 3.0 + 2.0 * jax.random.normal(observation_key, (G, N, OBSERVATION))
     noise = jax.random.normal(noise_key, (G, N, U))
-    action, log_prob = learner.act(state, config, observation, noise)
+    action, log_prob, _ = _ppo(config).act(state, observation, noise)
     advantage, return_ = 5.0 + 2.0 * jax.random.normal(target_key, (2, G, N))
     return Batch(
         observation=observation,
@@ -43,7 +49,7 @@ def _batch(state: LearnerState, seed: int = 0, config: AlgoConfig = CONFIG) -> B
 
 
 def _fresh(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
-    return learner.init(jax.random.key(seed), config, OBSERVATION, U, UPDATES)
+    return _ppo(config).init(jax.random.key(seed))
 
 
 def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
@@ -90,14 +96,16 @@ def test_act_mode_and_values_normalise_raw_observations() -> None:
     noise = jax.random.normal(jax.random.key(2), (4, 2, U))
     moments = state.normalizer
     normal = np.clip((observation - moments.mean) / np.sqrt(moments.variance), -10.0, 10.0)
-    mean, std = networks.action_distribution(state.params, CONFIG, normal)
-    action, log_prob = learner.act(state, CONFIG, observation, noise)
+    acted = _ppo().learning.networks.act(state.params, normal, ())
+    mean, std = acted.mean, acted.std
+    action, log_prob, _ = _ppo().act(state, observation, noise)
     # Float32 rounding of the normalisation, through weights of order 1.
-    np.testing.assert_allclose(learner.mode(state, CONFIG, observation), mean, atol=1e-5)
+    mode, _, _ = _ppo().act(state, observation, jnp.zeros_like(noise))
+    np.testing.assert_allclose(mode, mean, atol=1e-5)
     np.testing.assert_allclose(action, mean + std * noise, atol=1e-5)
     np.testing.assert_allclose(
-        learner.values(state, CONFIG, observation),
-        networks.value(state.params, CONFIG, normal),
+        _ppo().value(state, observation)[0],
+        _ppo().learning.networks.value(state.params, normal, (), ())[0],
         atol=1e-5,
     )
     # The standardised action is the noise: -0.5 z**2 - log(std) - 0.5 log(2 pi), summed over U.
@@ -107,16 +115,15 @@ def test_act_mode_and_values_normalise_raw_observations() -> None:
 
 def test_observations_are_cut_at_ten_deviations() -> None:
     far = jnp.array([1e4, -1e4, 10.5])
-    np.testing.assert_array_equal(learner.normalize(_fresh(), far), [10.0, -10.0, 10.0])
+    np.testing.assert_array_equal(ppo.normalize(_fresh(), far), [10.0, -10.0, 10.0])
 
 
 def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> None:
     state = _experienced(config=ONE_STEP)
     batch = _batch(state, 1, ONE_STEP)
     shifted = replace(batch, observation=batch.observation + 4.0)
-    action, log_prob = learner.act(
-        state, ONE_STEP, shifted.observation, jax.random.normal(jax.random.key(3), (G, N, U))
-    )
+    noise = jax.random.normal(jax.random.key(3), (G, N, U))
+    action, log_prob, _ = _ppo(ONE_STEP).act(state, shifted.observation, noise)
     shifted = replace(shifted, action=action, log_prob=log_prob)
     updated, metrics = _update(state, shifted, jax.random.key(2), config=ONE_STEP)
     # exp and log densities round at about 1e-6. With the updated normalizer, the approximate KL
@@ -125,13 +132,9 @@ def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> No
     assert metrics["clip_fraction"] == 0.0
     # At ratio 1 the surrogate is the mean of the normalised advantages: 0, up to rounding.
     np.testing.assert_allclose(metrics["policy_loss"], 0.0, atol=1e-5)
-    stale = learner.act(updated, ONE_STEP, shifted.observation, jnp.zeros((G, N, U)))[0]
-    fresh = learner.act(
-        replace(updated, normalizer=state.normalizer),
-        ONE_STEP,
-        shifted.observation,
-        jnp.zeros((G, N, U)),
-    )[0]
+    stale = _ppo(ONE_STEP).act(updated, shifted.observation, jnp.zeros((G, N, U)))[0]
+    before = replace(updated, normalizer=state.normalizer)
+    fresh = _ppo(ONE_STEP).act(before, shifted.observation, jnp.zeros((G, N, U)))[0]
     assert jnp.abs(stale - fresh).max() > 0.1
 
 
@@ -165,7 +168,7 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
     advantage = np.asarray(batch.advantage)
     inside = advantage[valid]
     minibatch = losses.Minibatch(
-        observation=learner.normalize(state, batch.observation)[valid],
+        observation=ppo.normalize(state, batch.observation)[valid],
         action=batch.action[valid],
         log_prob=batch.log_prob[valid],
         advantage=jnp.asarray((inside - inside.mean()) / inside.std()),
@@ -173,7 +176,11 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
         valid=jnp.ones(valid.sum(), bool),
     )
     (_, expected), gradient = jax.value_and_grad(losses.ppo_loss, has_aux=True)(
-        state.params, minibatch, ONE_STEP, jnp.float32(valid.sum())
+        state.params,
+        minibatch,
+        _ppo(ONE_STEP).learning.networks,
+        ONE_STEP,
+        jnp.float32(valid.sum()),
     )
     for name, metric in expected.items():
         # The same terms, of order 1 to 10, added in another order.
@@ -225,7 +232,7 @@ def test_each_epoch_learns_from_every_group_once() -> None:
     returns = jnp.broadcast_to(2.0 ** jnp.arange(G)[:, None], (G, N))
     batch = replace(batch, return_=returns, valid=jnp.ones((G, N), bool))
     _, metrics = _update(state, batch, jax.random.key(1), config=config)
-    value = learner.values(state, config, batch.observation)
+    value, _ = _ppo(config).value(state, batch.observation)
     # Float32 means of squares up to 128**2.
     np.testing.assert_allclose(
         metrics["value_loss"], 0.5 * np.mean((value - returns) ** 2), rtol=1e-5
@@ -296,7 +303,7 @@ def test_any_split_of_a_compiled_loop_gives_the_same_bits() -> None:
 
         def body(index: jax.Array, state: LearnerState) -> LearnerState:
             key = jax.random.fold_in(jax.random.key(1), index)
-            return learner.update(state, CONFIG, _batch(_fresh(), 1), key, UPDATES)[0]
+            return _ppo().update(state, _batch(_fresh(), 1), key)[0]
 
         return jax.lax.fori_loop(start, stop, body, state)
 
@@ -330,7 +337,7 @@ def test_learners_under_vmap_equal_single_ones() -> None:
 
 def test_initialised_under_vmap_each_learner_is_its_own() -> None:
     keys = jax.random.split(jax.random.key(0), 2)
-    states = jax.vmap(lambda key: learner.init(key, CONFIG, OBSERVATION, U, UPDATES))(keys)
+    states = jax.vmap(_ppo().init)(keys)
     kernel = states.params["actor"]["mean"]["kernel"]
     assert kernel.shape == (2, 8, U)
     assert np.all(kernel[0] != kernel[1])
@@ -379,7 +386,7 @@ def test_observations_may_be_left_as_they_are() -> None:
     updated, _ = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
     _assert_equal(updated.normalizer, state.normalizer)
     seen = jnp.array([4.0, -3.25, 0.5])
-    np.testing.assert_array_equal(learner.normalize(updated, seen), seen)
+    np.testing.assert_array_equal(ppo.normalize(updated, seen), seen)
 
 
 def test_advantages_may_be_left_as_they_are() -> None:

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 import scipy.stats
 from flax import traverse_util
 
-from swarmjax.ppo import networks
+from swarmjax.ppo import gaussian
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.losses import Minibatch, ppo_loss
 
@@ -17,7 +18,8 @@ B, OBSERVATION, U = 24, 3, 2
 CONFIG = AlgoConfig(
     hidden_sizes=(8,), clip_epsilon=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4
 )
-PARAMS = networks.init_params(jax.random.key(0), CONFIG, OBSERVATION, U)
+NETS = learners.nets(CONFIG, OBSERVATION, U)
+PARAMS = NETS.init(jax.random.key(0))
 PARAMS["actor"]["mean"]["kernel"] *= 150.0  # so that means lie on both sides of -1 and of 1
 
 
@@ -25,8 +27,8 @@ def _minibatch(valid_share: float = 0.6) -> Minibatch:
     random = np.random.default_rng(0)
     observation = random.normal(size=(B, OBSERVATION)).astype(np.float32)
     action = random.normal(size=(B, U)).astype(np.float32)
-    mean, std = networks.action_distribution(PARAMS, CONFIG, observation)
-    log_prob = np.asarray(networks.log_prob(mean, std, action))
+    mean, std, *_ = NETS.act(PARAMS, observation, ())
+    log_prob = np.asarray(gaussian.log_prob(mean, std, action))
     return Minibatch(
         observation=observation,
         action=action,
@@ -39,8 +41,8 @@ def _minibatch(valid_share: float = 0.6) -> Minibatch:
 
 
 def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
-    mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
-    value = np.asarray(networks.value(PARAMS, CONFIG, minibatch.observation), np.float64)
+    mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
+    value = np.asarray(NETS.value(PARAMS, minibatch.observation, (), ())[0], np.float64)
     log_prob = scipy.stats.norm.logpdf(minibatch.action, mean, std).sum(axis=-1)
     total = dict.fromkeys(
         ("policy_loss", "value_loss", "bound_loss", "entropy", "approx_kl", "clip_fraction"), 0.0
@@ -64,7 +66,7 @@ def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
 @pytest.mark.parametrize("expected_valid", [0.25, 5.0, 14.0])
 def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
     minibatch = _minibatch()
-    loss, metrics = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(expected_valid))
+    loss, metrics = ppo_loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(expected_valid))
     expected = _expected(minibatch, expected_valid)
     assert expected["clip_fraction"] > 0.0
     assert expected["bound_loss"] > 0.0
@@ -77,8 +79,8 @@ def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
 
 def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     minibatch = _minibatch()
-    mean, std = networks.action_distribution(PARAMS, CONFIG, minibatch.observation)
-    log_prob = networks.log_prob(mean, std, minibatch.action)
+    mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
+    log_prob = gaussian.log_prob(mean, std, minibatch.action)
     config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0, bound_cost=0.0)
 
     def slope(ratio: float, advantage: float) -> float:
@@ -88,7 +90,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
             advantage=np.full(B, advantage, np.float32),
             valid=np.ones(B, bool),
         )
-        gradient = jax.grad(lambda p: ppo_loss(p, samples, config, jnp.float32(B))[0])(PARAMS)
+        gradient = jax.grad(lambda p: ppo_loss(p, samples, NETS, config, jnp.float32(B))[0])(PARAMS)
         return float(jnp.abs(gradient["actor"]["mean"]["kernel"]).max())
 
     # The minimum in equation 7 of the PPO paper is flat only where the ratio has left the clip
@@ -104,7 +106,7 @@ def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
     # The log ratio is about 1000: if it were masked only after exp, its gradient would be NaN.
     minibatch = replace(minibatch, log_prob=minibatch.log_prob - 1000.0)
     (loss, metrics), gradient = jax.value_and_grad(ppo_loss, has_aux=True)(
-        PARAMS, minibatch, CONFIG, jnp.float32(0.0)
+        PARAMS, minibatch, NETS, CONFIG, jnp.float32(0.0)
     )
     for leaf in jax.tree.leaves((loss, metrics, gradient)):
         np.testing.assert_array_equal(leaf, np.zeros(leaf.shape))
@@ -112,10 +114,11 @@ def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
 
 def test_float_masks_count_as_boolean_ones() -> None:
     minibatch = _minibatch()
-    expected = ppo_loss(PARAMS, minibatch, CONFIG, jnp.float32(14.0))
+    expected = ppo_loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(14.0))
     got = ppo_loss(
         PARAMS,
         replace(minibatch, valid=minibatch.valid.astype(np.float32)),
+        NETS,
         CONFIG,
         jnp.float32(14.0),
     )
@@ -128,12 +131,13 @@ def test_mean_over_unevenly_filled_minibatches_is_the_loss_of_the_batch() -> Non
     valid[[0, 1, 2, 3, 4, 5, 6, 7, 9]] = True
     batch = replace(batch, valid=valid)
     loss = jax.value_and_grad(ppo_loss, has_aux=True)
-    whole = loss(PARAMS, batch, CONFIG, jnp.float32(9.0))
+    whole = loss(PARAMS, batch, NETS, CONFIG, jnp.float32(9.0))
     # Three minibatches of eight samples have 8, 1 and 0 valid samples; each expects 9 / 3 = 3.
     parts = [
         loss(
             PARAMS,
             jax.tree.map(lambda x, start=start: x[start : start + 8], batch),
+            NETS,
             CONFIG,
             jnp.float32(3.0),
         )
@@ -150,6 +154,7 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
         ppo_loss(
             PARAMS,
             replace(minibatch, return_=minibatch.return_[:, None]),
+            NETS,
             CONFIG,
             jnp.float32(1.0),
         )
@@ -158,12 +163,14 @@ def test_shapes_that_would_broadcast_are_refused() -> None:
 def test_the_guess_of_the_state_is_charged_by_its_squared_error() -> None:
     size, cost = 5, 0.3
     config = replace(CONFIG, critic="state", guess_cost=cost)
-    params = networks.init_params(jax.random.key(0), config, OBSERVATION, U, size)
+    nets = learners.nets(config, OBSERVATION, U, size)
+    params = nets.init(jax.random.key(0))
     state = np.random.default_rng(1).normal(size=(B, size)).astype(np.float32)
     minibatch = replace(_minibatch(), state=state)
     count = jnp.float32(14.0)
-    loss, metrics = ppo_loss(params, minibatch, config, count)
-    free, without = ppo_loss(params, minibatch, replace(config, guess_cost=0.0), count)
+    loss, metrics = ppo_loss(params, minibatch, nets, config, count)
+    unpriced = replace(config, guess_cost=0.0)
+    free, without = ppo_loss(params, minibatch, nets, unpriced, count)
     flat = traverse_util.flatten_dict(params["actor"], sep="/")
     layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}
     hidden = np.tanh(

@@ -5,18 +5,21 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 from flax import linen as nn
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import ConfigError
-from swarmjax.ppo import learner, losses, networks
+from swarmjax.ppo import losses
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.gae import generalized_advantages
-from swarmjax.ppo.learner import Batch
 from swarmjax.ppo.losses import Minibatch
-from swarmjax.ppo.memory import Gru, Recall
+from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO
 from swarmjax.task import observation
 
 STEPS, ROWS, WIDTH, SIZE = 6, 3, 4, 5
@@ -115,12 +118,13 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
         minibatch = jax.tree.map(
             lambda x: x.astype(float) if x.dtype == jnp.float32 else x, _minibatch()
         )
-        params = networks.init_params(jax.random.key(0), CONFIG, WIDTH, 2)
+        nets = learners.nets(CONFIG, WIDTH, 2)
+        params = nets.init(jax.random.key(0))
         flat, tree = ravel_pytree(jax.tree.map(lambda x: x.astype(float), params))
         towards = np.random.default_rng(0).normal(size=(4, len(flat)))
 
         def loss(flat: jax.Array) -> jax.Array:
-            return losses.ppo_loss(tree(flat), minibatch, CONFIG, jnp.float64(20.0))[0]
+            return losses.ppo_loss(tree(flat), minibatch, nets, CONFIG, jnp.float64(20.0))[0]
 
         gradient, step = jax.grad(loss)(flat), 1e-6
         for way in towards:
@@ -135,7 +139,7 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
 _EPISODE, _WORLDS, _UPDATES = 21, 64, 150
 
 
-def _play(config: AlgoConfig, state: Any, key: jax.Array, history: int) -> tuple[Batch, jax.Array]:
+def _play(ppo: PPO, state: Any, key: jax.Array, history: int) -> tuple[Batch, jax.Array]:
     """Plays one episode in each world and returns the batch and the mean reward.
 
     The first step shows a cue of -1 or 1, and the last step rewards an action of the cue's sign.
@@ -149,16 +153,15 @@ def _play(config: AlgoConfig, state: Any, key: jax.Array, history: int) -> tuple
     looks = jnp.stack([shown, asked], axis=-1)
     seen = jax.lax.scan(_stacked, jnp.zeros((_WORLDS, 2 * history)), looks)[1]
     noise = jax.random.normal(noise_key, (_EPISODE, _WORLDS, 1))
-    memory = networks.begin_memory(config, (_WORLDS,))
+    memory = ppo.begin_memory((_WORLDS,))
 
     def step(carry: Any, now: Any) -> tuple[Any, Any]:
         mine, theirs = carry
-        action, log_prob, mine = learner.recall_act(state, config, now[0], now[1], mine)
-        value, theirs = learner.recall_values(state, config, now[0], theirs)
+        action, log_prob, mine = ppo.act(state, now[0], now[1], mine)
+        value, theirs = ppo.value(state, now[0], (), theirs)
         return (mine, theirs), (action, log_prob, value)
 
-    first = (None, None) if memory is None else tuple(memory)
-    _, (action, log_prob, value) = jax.lax.scan(step, first, (seen, noise))
+    _, (action, log_prob, value) = jax.lax.scan(step, tuple(memory), (seen, noise))
     reward = asked * jnp.where(jnp.sign(action[..., 0]) == cue, 1.0, 0.0)
     over = asked > 0
     next_value = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
@@ -169,7 +172,7 @@ def _play(config: AlgoConfig, state: Any, key: jax.Array, history: int) -> tuple
     parts = (seen, action, log_prob, advantage, return_, jnp.ones_like(over), begins)
     grouped = [jnp.moveaxis(x, 0, 1) for x in parts]
     batch = Batch(**dict(zip(_FIELDS, grouped[:6], strict=True)))
-    if memory is not None:
+    if ppo.config.memory == "gru":
         groups = jax.tree.map(lambda x: x[:, None], memory)
         batch = replace(batch, memory=groups, begins=grouped[6])
     return batch, jnp.sum(reward) / _WORLDS
@@ -197,7 +200,7 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
 ) -> None:
     config = AlgoConfig(
         memory=memory,
-        memory_size=16 if memory == "gru" else None,
+        memory_size=16 if memory == "gru" else 64,
         hidden_sizes=(16,),
         rollout_length=_EPISODE,
         num_minibatches=2,
@@ -208,14 +211,15 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
         learning_rate_schedule="constant",
         bound_cost=0.0,
     )
-    state = learner.init(jax.random.key(3), config, 2 * history, 1, _UPDATES)
+    ppo = learners.ppo(config, Sizes(2 * history, 1), _UPDATES, "autodiff")
+    state = ppo.init(jax.random.key(3))
 
     @jax.jit
     def train(state: Any) -> tuple[Any, jax.Array]:
         def update(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             play_key, learn_key = jax.random.split(key)
-            batch, success = _play(config, state, play_key, history)
-            return learner.update(state, config, batch, learn_key, _UPDATES)[0], success
+            batch, success = _play(ppo, state, play_key, history)
+            return ppo.update(state, batch, learn_key)[0], success
 
         return jax.lax.scan(update, state, jax.random.split(jax.random.key(4), _UPDATES))
 
@@ -242,8 +246,8 @@ def test_a_memory_that_is_no_number_spoils_nothing() -> None:
         memory=Recall(jnp.array(memory), jnp.array(memory)),
         begins=jnp.zeros(shape, bool),
     )
-    state = learner.init(jax.random.key(0), CONFIG, WIDTH, 2, 10)
-    after, metrics = learner.update(state, CONFIG, batch, jax.random.key(1), 10)
+    ppo = learners.ppo(CONFIG, Sizes(WIDTH, 2), backend="autodiff")
+    after, metrics = ppo.update(ppo.init(jax.random.key(0)), batch, jax.random.key(1))
     assert float(metrics["skipped_steps"]) == 0.0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after.params))
 
@@ -268,14 +272,13 @@ def test_refuses_what_goes_with_no_memory(changed: dict[str, Any], said: str) ->
 
 def test_a_uniform_unit_begins_within_the_bound_of_pytorch() -> None:
     config = replace(CONFIG, initialization="uniform", memory_size=64)
-    params = networks.init_params(jax.random.key(0), config, WIDTH, 2)["actor"]["memory"]
+    params = learners.nets(config, WIDTH, 2).init(jax.random.key(0))["actor"]["memory"]
     for part in jax.tree.leaves(params):
         assert 0.1 < np.abs(part).max() <= 1 / 8
 
 
 def test_a_memory_begins_empty() -> None:
-    assert networks.begin_memory(AlgoConfig(), (2, 3)) is None
-    made = networks.begin_memory(CONFIG, (2, 3))
-    assert made is not None
+    assert learners.nets(AlgoConfig(), 3, 2).begin_memory((2, 3)) == NO_MEMORY
+    made = learners.nets(CONFIG, 3, 2).begin_memory((2, 3))
     assert [x.shape for x in made] == [(2, 3, SIZE)] * 2
     assert not any(np.any(x) for x in made)

@@ -1,17 +1,16 @@
 """Checks the networks against a forward pass in NumPy, and the Gaussian against SciPy."""
 
-from collections.abc import Callable
-
 import hypothesis
 import hypothesis.extra.numpy as hypothesis_numpy
 import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 import scipy.stats
 
-from swarmjax.ppo import networks
+from swarmjax.ppo import gaussian, networks
 from swarmjax.ppo.config import AlgoConfig
 
 OBSERVATION, U = 3, 2
@@ -23,8 +22,12 @@ ACTIVATIONS = {
 }
 
 
+def _nets(config: AlgoConfig = CONFIG) -> networks.Networks:
+    return learners.nets(config, OBSERVATION, U)
+
+
 def _params(config: AlgoConfig = CONFIG) -> networks.Params:
-    return networks.init_params(jax.random.key(0), config, OBSERVATION, U)
+    return _nets(config).init(jax.random.key(0))
 
 
 def _forward(network: networks.Params, activation: str, head: str, x: np.ndarray) -> np.ndarray:
@@ -62,7 +65,7 @@ def test_layers_start_orthogonal_with_their_gain_and_no_bias(
 
 def test_std_starts_at_the_configured_one_for_every_observation() -> None:
     observation = jax.random.normal(jax.random.key(1), (4, 6, OBSERVATION))
-    mean, std = networks.action_distribution(_params(), CONFIG, observation)
+    mean, std, *_ = _nets().act(_params(), observation, ())
     assert mean.shape == (4, 6, U)
     # log and exp in float32.
     np.testing.assert_allclose(std, [0.6, 0.6], rtol=1e-6)
@@ -73,8 +76,8 @@ def test_networks_equal_a_forward_pass_in_numpy(activation: str) -> None:
     config = AlgoConfig(hidden_sizes=(8, 5), activation=activation)
     params = _params(config)
     observation = np.asarray(jax.random.normal(jax.random.key(1), (4, 6, OBSERVATION)))
-    mean, _ = networks.action_distribution(params, config, observation)
-    value = networks.value(params, config, observation)
+    mean = _nets(config).act(params, observation, ()).mean
+    value, _ = _nets(config).value(params, observation, (), ())
     # Sums of at most eight float32 products of order 1; the means themselves are of order 0.01.
     np.testing.assert_allclose(
         mean, _forward(params["actor"], activation, "mean", observation), atol=1e-7
@@ -93,33 +96,35 @@ def test_networks_equal_a_forward_pass_in_numpy(activation: str) -> None:
 def test_log_prob_equals_scipy(mean: np.ndarray, action: np.ndarray, std: np.ndarray) -> None:
     expected = scipy.stats.norm.logpdf(action, mean, std).sum(axis=-1)
     # float32 relative rounding of terms up to 0.5 * (6 / 0.125)**2 = 1152.
-    np.testing.assert_allclose(networks.log_prob(mean, std, action), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(gaussian.log_prob(mean, std, action), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_entropy_equals_scipy() -> None:
     std = np.array([0.2, 1.7], np.float32)
     # float32 rounding of terms of order 1.
     np.testing.assert_allclose(
-        networks.entropy(std), scipy.stats.norm.entropy(scale=std).sum(), atol=1e-6
+        gaussian.entropy(std), scipy.stats.norm.entropy(scale=std).sum(), atol=1e-6
     )
 
 
 def test_actor_and_critic_share_nothing() -> None:
     observation = np.ones((1, OBSERVATION), np.float32)
-    gradient = jax.grad(lambda params: networks.value(params, CONFIG, observation)[0])(_params())
+    gradient = jax.grad(lambda params: _nets().value(params, observation, (), ())[0][0])(_params())
     assert all(np.all(np.asarray(leaf) == 0.0) for leaf in jax.tree.leaves(gradient["actor"]))
     assert np.any(np.asarray(gradient["critic"]["torso"]["hidden_0"]["kernel"]) != 0.0)
 
 
-@pytest.mark.parametrize("network", [networks.action_distribution, networks.value])
-def test_wrong_observation_size_is_refused(network: Callable[..., object]) -> None:
+def test_wrong_observation_size_is_refused() -> None:
+    wrong = np.zeros((2, OBSERVATION + 1), np.float32)
     with pytest.raises(AssertionError):
-        network(_params(), CONFIG, np.zeros((2, OBSERVATION + 1), np.float32))
+        _nets().act(_params(), wrong, ())
+    with pytest.raises(AssertionError):
+        _nets().value(_params(), wrong, (), ())
 
 
 def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() -> None:
     config = AlgoConfig(hidden_sizes=(64, 32), initialization="uniform")
-    params = networks.init_params(jax.random.key(0), config, 100, 50)
+    params = learners.nets(config, 100, 50).init(jax.random.key(0))
     for network, last in (("actor", "mean"), ("critic", "value")):
         torso = params[network]["torso"]
         layers = (torso["hidden_0"], torso["hidden_1"], params[network][last])
@@ -139,13 +144,12 @@ def test_pytorchs_initialisation_spreads_weights_and_biases_by_their_inputs() ->
 
 def test_an_output_of_tanh_keeps_the_mean_within_the_commands() -> None:
     linear = AlgoConfig(hidden_sizes=(8,))
-    params = networks.init_params(jax.random.key(0), linear, 3, 2)
+    params = _nets(linear).init(jax.random.key(0))
     params["actor"]["mean"]["kernel"] *= 300.0
     observation = jax.random.normal(jax.random.key(1), (5, 3))
-    mean, std = networks.action_distribution(params, linear, observation)
-    squashed, same = networks.action_distribution(
-        params, AlgoConfig(hidden_sizes=(8,), mean_activation="tanh"), observation
-    )
+    mean, std, *_ = _nets(linear).act(params, observation, ())
+    bounded = _nets(AlgoConfig(hidden_sizes=(8,), mean_activation="tanh"))
+    squashed, same, *_ = bounded.act(params, observation, ())
     assert np.abs(mean).max() > 1.0
     np.testing.assert_allclose(squashed, np.tanh(mean), rtol=1e-6)  # float32
     np.testing.assert_array_equal(same, std)
@@ -154,9 +158,9 @@ def test_an_output_of_tanh_keeps_the_mean_within_the_commands() -> None:
 @pytest.mark.parametrize(("exploration", "moves"), [("learned", True), ("scheduled", False)])
 def test_no_gradient_reaches_a_scheduled_deviation(exploration: str, moves: bool) -> None:
     config = AlgoConfig(hidden_sizes=(8,), exploration=exploration)
-    params = networks.init_params(jax.random.key(0), config, 3, 2)
+    params = _params(config)
 
     def total(params: networks.Params) -> jax.Array:
-        return networks.action_distribution(params, config, jnp.ones(3))[1].sum()
+        return _nets(config).act(params, jnp.ones(3), ()).std.sum()
 
     assert bool(jax.grad(total)(params)["actor"]["log_std"].any()) is moves

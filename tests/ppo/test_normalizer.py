@@ -98,13 +98,13 @@ def test_normalize_is_shift_scale_and_clip() -> None:
     expected = [[1.0, -10.0, 0.0], [-0.5, 1.0, 1.0]]
     # float32 rounds 5.001 by at most 2**-22, so the result is off by at most
     # 2**-22 / 0.001 = 2.4e-4.
-    np.testing.assert_allclose(normalizer.normalize(state, observation, 10.0), expected, atol=5e-4)
+    np.testing.assert_allclose(normalizer.normalize(state, observation), expected, atol=5e-4)
 
 
 def test_fresh_normalizer_leaves_observations_as_they_are() -> None:
     observation = np.array([[0.5, -3.0, 9.0]], np.float32)
     np.testing.assert_array_equal(
-        normalizer.normalize(normalizer.init(OBSERVATION), observation, 10.0), observation
+        normalizer.normalize(normalizer.init(OBSERVATION), observation), observation
     )
 
 

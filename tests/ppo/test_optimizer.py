@@ -2,11 +2,13 @@
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
 from swarmjax.ppo import optimizer
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.optimizer import Learning
 
 
 @pytest.mark.parametrize(
@@ -64,10 +66,12 @@ def test_an_update_that_took_no_step_has_no_means_if_one_was_skipped() -> None:
 def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> None:
     config = AlgoConfig(epochs=1, num_minibatches=1)
     params = {"actor": {"w": jnp.ones(3)}, "critic": {"w": jnp.ones(2)}}
-    progress = (params, optimizer.make(config, 5).init(params))
+    adam = optimizer.make(config, 5)
+    learning = Learning(config, learners.nets(config, 1, 1), adam)
+    progress = (params, adam.init(params))
     gradient = {"actor": {"w": jnp.array([1.0, jnp.nan, 0.0])}, "critic": {"w": jnp.ones(2)}}
     loss = {"policy_loss": jnp.float32(jnp.nan)}
-    found, metrics = optimizer.take(config, 5, progress, (gradient, loss), jnp.array(True))
+    found, metrics = optimizer.take(learning, progress, (gradient, loss), jnp.array(True))
     jax.tree.map(np.testing.assert_array_equal, found, progress)
     assert metrics["skipped_steps"] == 1.0
     assert metrics["policy_loss"] == 0.0

@@ -6,19 +6,22 @@ Jones, "Debugging Reinforcement Learning Systems" (2021).
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import learner
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import fused
 from swarmjax.ppo.gae import generalized_advantages
-from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import LearnerState
 
 WORLDS, UPDATES = 32, 60
 CONFIG = AlgoConfig(
@@ -30,6 +33,9 @@ CONFIG = AlgoConfig(
     actor_learning_rate=1e-2,
     critic_learning_rate=1e-2,
 )
+
+
+PPO_ = learners.ppo(CONFIG, Sizes(1, 1), UPDATES, "autodiff")
 
 
 class Probe(NamedTuple):
@@ -62,7 +68,7 @@ def _act(
     noise_key, reset_key = jax.random.split(key)
     observation = _observe(probe, world)
     noise = jax.random.normal(noise_key, (WORLDS, 1))
-    action, log_prob = learner.act(state, CONFIG, observation, noise)
+    action, log_prob, _ = PPO_.act(state, observation, noise)
     reached = world._replace(clock=world.clock + 1)
     ended = reached.clock == probe.length
     step = {
@@ -70,8 +76,8 @@ def _act(
         "action": action,
         "log_prob": log_prob,
         "reward": probe.reward(world.draw, action[:, 0], world.clock.astype(jnp.float32)),
-        "value": learner.values(state, CONFIG, observation),
-        "next_value": learner.values(state, CONFIG, _observe(probe, reached)),
+        "value": PPO_.value(state, observation)[0],
+        "next_value": PPO_.value(state, _observe(probe, reached))[0],
         "terminated": ended & (not probe.ends_by_truncation),
         "truncated": ended & probe.ends_by_truncation,
     }
@@ -98,7 +104,7 @@ def _iterate(
     samples = {name: steps[name] for name in ("observation", "action", "log_prob")}
     samples |= {"advantage": advantage, "return_": return_, "valid": jnp.ones_like(advantage)}
     batch = Batch(**jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), samples))
-    state, _ = learner.update(state, CONFIG, batch, update_key, UPDATES, backend)
+    state, _ = replace(PPO_, backend=backend).update(state, batch, update_key)
     return (state, world), None
 
 
@@ -110,17 +116,18 @@ def _solve(probe: Probe, first: float = 0.0, backend: Backend = "autodiff") -> L
     def run(state: LearnerState, world: World, keys: jax.Array) -> LearnerState:
         return jax.lax.scan(functools.partial(_iterate, probe, backend), (state, world), keys)[0][0]
 
-    state = learner.init(init_key, CONFIG, 1, 1, UPDATES)
+    state = PPO_.init(init_key)
     state.params["actor"]["mean"]["bias"] = jnp.array([first])
     return run(state, _start(world_key), jax.random.split(loop_key, UPDATES))
 
 
 def _values(state: LearnerState, *observations: float) -> jax.Array:
-    return learner.values(state, CONFIG, jnp.array(observations)[:, None])
+    return PPO_.value(state, jnp.array(observations)[:, None])[0]
 
 
 def _modes(state: LearnerState, *observations: float) -> jax.Array:
-    return learner.mode(state, CONFIG, jnp.array(observations)[:, None])[:, 0]
+    seen = jnp.array(observations)[:, None]
+    return PPO_.act(state, seen, jnp.zeros_like(seen))[0][:, 0]
 
 
 def test_critic_learns_a_constant() -> None:

@@ -6,17 +6,19 @@ from functools import partial
 import chex
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import losses
+from swarmjax.ppo import losses, ppo
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import sequences
-from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.memory import Recall
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.shards import Shards
 
 GROUPS, ROBOTS, STEPS, SIZE, UPDATES = 4, 5, 8, 3, 10
@@ -62,15 +64,19 @@ def _batch(seed: int = 0, ends: np.ndarray = ENDS) -> Batch:
     )
 
 
+def _ppo(config: AlgoConfig, backend: Backend = "sequences") -> PPO:
+    return learners.ppo(config, Sizes(OBSERVATION, ACTION), UPDATES, backend)
+
+
 def _learner(seed: int = 0) -> LearnerState:
-    return ppo.init(jax.random.key(seed), CONFIG, OBSERVATION, ACTION, UPDATES)
+    return _ppo(CONFIG).init(jax.random.key(seed))
 
 
 @partial(jax.jit, static_argnums=(2, 3))
 def _update(
     learner: LearnerState, batch: Batch, config: AlgoConfig, backend: Backend = "sequences"
 ) -> tuple[LearnerState, Metrics]:
-    return ppo.update(learner, config, batch, jax.random.key(1), UPDATES, backend)
+    return _ppo(config, backend).update(learner, batch, jax.random.key(1))
 
 
 def _samples(batch: Batch) -> Minibatch:
@@ -85,11 +91,14 @@ def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int
     dealt = sequences.deal(jax.random.key(3), rows.valid.any(axis=1), minibatches)
     config = replace(CONFIG, num_minibatches=minibatches)
     parts = [
-        sequences.gradient(params, rows, dealt.order, span, config, count) for span in dealt.span
+        sequences.gradient(params, rows, dealt.order, span, _ppo(config).learning, count)
+        for span in dealt.span
     ]
     found = jax.tree.map(lambda *x: sum(x), *parts)
     whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
-    expected = jax.grad(losses.ppo_loss, has_aux=True)(params, whole, CONFIG, count)
+    expected = jax.grad(losses.ppo_loss, has_aux=True)(
+        params, whole, _ppo(CONFIG).learning.networks, CONFIG, count
+    )
     # Sums of 80 float32 terms of order 1 to 100, added in another order.
     chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
 

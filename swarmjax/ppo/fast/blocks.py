@@ -14,12 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from swarmjax.ppo import losses, optimizer
-from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import Progress
-from swarmjax.shards import ALONE, Shards
+from swarmjax.ppo.optimizer import Learning, Progress
 
 # Samples of a block. With layers of 64, sizes from 100 to 6,000 were tried: 250 to 400 samples took
 # the least CPU time.
@@ -39,39 +37,30 @@ class Blocks(NamedTuple):
 
 
 def learn(
-    config: AlgoConfig,
-    updates: int,
-    begun: Progress,
-    samples: Minibatch,
-    _: jax.Array,
-    shards: Shards = ALONE,
+    learning: Learning, begun: Progress, samples: Minibatch, _: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
 
     Args:
-      config: Settings with one minibatch.
-      updates: Number of updates of the whole run.
+      learning: Settings with one minibatch, networks and optimiser.
       begun: Parameters and the optimiser's state.
       samples: [G, N, ...], zero where not valid.
-      shards: How the samples are spread over devices.
 
     Returns:
       Parameters and the optimiser's state after, and the metrics of each step, [epochs].
     """
-    return in_turn(functools.partial(_learn, config, updates, shards))(begun, samples)
+    return in_turn(functools.partial(_learn, learning))(begun, samples)
 
 
-def _learn(
-    config: AlgoConfig, updates: int, shards: Shards, begun: Progress, samples: Minibatch
-) -> tuple[Progress, Metrics]:
+def _learn(learning: Learning, begun: Progress, samples: Minibatch) -> tuple[Progress, Metrics]:
     """Runs all epochs, each one step on all samples; the metrics of each are [epochs]."""
-    blocks, count = arrange(samples), shards.sum(jnp.sum(samples.valid))
+    blocks, count = arrange(samples), learning.shards.sum(jnp.sum(samples.valid))
 
     def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
-        found = gradient(progress[0], blocks, config, count)
-        return optimizer.take(config, updates, progress, found, count > 0, shards)
+        found = gradient(progress[0], blocks, learning, count)
+        return optimizer.take(learning, progress, found, count > 0)
 
-    return jax.lax.scan(epoch, begun, length=config.epochs)
+    return jax.lax.scan(epoch, begun, length=learning.config.epochs)
 
 
 def arrange(samples: Minibatch) -> Blocks:
@@ -96,14 +85,14 @@ def arrange(samples: Minibatch) -> Blocks:
 
 
 def gradient(
-    params: Params, blocks: Blocks, config: AlgoConfig, expected_valid: jax.Array
+    params: Params, blocks: Blocks, learning: Learning, expected_valid: jax.Array
 ) -> tuple[Params, Metrics]:
     """Computes the gradient of `losses.ppo_loss` over all samples.
 
     Args:
       params: Parameters of the actor and the critic.
       blocks: The samples.
-      config: Clip range and costs.
+      learning: Networks, clip range and costs.
       expected_valid: [], valid samples of the batch.
 
     Returns:
@@ -112,7 +101,9 @@ def gradient(
 
     def of_block(i: jax.Array | int) -> tuple[Params, Metrics]:
         block = jax.tree.map(lambda x: x[i], blocks.samples)
-        return jax.grad(losses.ppo_loss, has_aux=True)(params, block, config, expected_valid)
+        return jax.grad(losses.ppo_loss, has_aux=True)(
+            params, block, learning.networks, learning.config, expected_valid
+        )
 
     return add_up(blocks.used, of_block)
 

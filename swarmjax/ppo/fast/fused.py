@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from swarmjax.ppo import networks
+from swarmjax.ppo import gaussian
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
 from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
@@ -245,7 +245,7 @@ def flat_gradient(
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
-    metrics["entropy"] = networks.entropy(deviation) * weight
+    metrics["entropy"] = gaussian.entropy(deviation) * weight
     found = {
         "actor": _with_entropy(actor * share, config, weight, first, width),
         "critic": critic * (config.value_cost * share),
@@ -342,7 +342,7 @@ def _surrogate(
         * advantage
     )
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
-    beyond = jnp.where(valid[:, None], networks.beyond_range(mean), 0.0)
+    beyond = jnp.where(valid[:, None], gaussian.beyond_range(mean), 0.0)
     slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
     if config.mean_activation == "tanh":
         slope *= 1.0 - mean * mean

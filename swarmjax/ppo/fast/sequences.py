@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from swarmjax.ppo import losses, optimizer
-from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import blocks
 from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import Progress
+from swarmjax.ppo.optimizer import Learning, Progress
 from swarmjax.shards import ALONE, Shards
 
 # Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
@@ -49,26 +49,20 @@ class Dealt(NamedTuple):
 
 
 def learn(
-    config: AlgoConfig,
-    updates: int,
-    begun: Progress,
-    samples: Minibatch,
-    key: jax.Array,
-    shards: Shards = ALONE,
+    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of useful sequences.
 
     Args:
-      config: Settings of networks with memory.
-      updates: Number of updates of the whole run.
+      learning: Settings, networks with memory, and the optimiser.
       begun: Parameters and the optimiser's state.
       samples: [G, N, ...], zero where not valid, ordered by step.
       key: Random key, consumed.
-      shards: How the samples are spread over devices.
 
     Returns:
       Parameters and the optimiser's state after, and the metrics of each step, [epochs, M].
     """
+    config, shards = learning.config, learning.shards
     rows = arrange(samples, config.rollout_length)
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
 
@@ -76,8 +70,8 @@ def learn(
         dealt = deal(key, jnp.any(rows.valid, axis=1), config.num_minibatches, shards)
 
         def step(progress: Progress, span: jax.Array) -> tuple[Progress, Metrics]:
-            found = gradient(progress[0], rows, dealt.order, span, config, expected_valid)
-            return optimizer.take(config, updates, progress, found, span[1] > span[0], shards)
+            found = gradient(progress[0], rows, dealt.order, span, learning, expected_valid)
+            return optimizer.take(learning, progress, found, span[1] > span[0])
 
         return jax.lax.scan(step, progress, dealt.span)
 
@@ -100,7 +94,7 @@ def arrange(samples: Minibatch, steps: int) -> Minibatch:
         return jnp.moveaxis(split, 1, 2).reshape(-1, steps, *x.shape[2:])
 
     memory = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), samples.memory)
-    return replace(jax.tree.map(by_sequence, replace(samples, memory=None)), memory=memory)
+    return replace(jax.tree.map(by_sequence, replace(samples, memory=NO_MEMORY)), memory=memory)
 
 
 def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE) -> Dealt:
@@ -140,7 +134,7 @@ def gradient(
     rows: Minibatch,
     order: jax.Array,
     span: jax.Array,
-    config: AlgoConfig,
+    learning: Learning,
     expected_valid: jax.Array,
 ) -> tuple[Params, Metrics]:
     """Computes the gradient of `losses.ppo_loss` over the sequences of one minibatch.
@@ -150,18 +144,21 @@ def gradient(
       rows: Result of `arrange`.
       order: [Q], result of `deal`.
       span: [2], int32, where in `order` the minibatch begins and ends.
-      config: Clip range and costs.
+      learning: Networks, clip range and costs.
       expected_valid: [], valid samples of the whole batch / number of minibatches.
 
     Returns:
       The gradient, and the metrics of the loss; 0 if the span is empty.
     """
-    steps, learners = config.rollout_length, config.side_by_side
+    config = learning.config
+    steps, learners = config.rollout_length, learning.side_by_side
     size = tile_size(len(order), config.num_minibatches, steps, learners)
 
     def of_tile(i: jax.Array | int) -> tuple[Params, Metrics]:
         tile = take_tile(rows, order, span[0] + i * size, span[1], size)
-        return jax.grad(losses.ppo_loss, has_aux=True)(params, tile, config, expected_valid)
+        return jax.grad(losses.ppo_loss, has_aux=True)(
+            params, tile, learning.networks, config, expected_valid
+        )
 
     return blocks.add_up(tiles_of(span, size), of_tile)
 
@@ -214,7 +211,7 @@ def take_tile(
     which = order[jnp.minimum(place, len(order) - 1)]
     tile = jax.tree.map(lambda x: x[which], rows)
     tile = replace(tile, valid=tile.valid.astype(bool) & (place < end)[:, None])
-    flat = jax.tree.map(_by_step, replace(tile, memory=None))
+    flat = jax.tree.map(_by_step, replace(tile, memory=NO_MEMORY))
     return replace(flat, memory=tile.memory)
 
 

@@ -13,22 +13,15 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.ppo import optimizer
-from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import fused
 from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import METRICS, Progress
-from swarmjax.shards import ALONE, Shards
+from swarmjax.ppo.optimizer import METRICS, Learning, Progress
 
 
 def learn(
-    config: AlgoConfig,
-    updates: int,
-    begun: Progress,
-    samples: Minibatch,
-    key: jax.Array,
-    shards: Shards = ALONE,
+    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of tiles of valid samples.
 
@@ -40,18 +33,17 @@ def learn(
     each.
 
     Args:
-      config: Settings of networks that `fused.fits` accepts.
-      updates: Number of updates of the whole run.
+      learning: Settings and networks that `fused.fits` accepts, and the optimiser.
       begun: Parameters and the optimiser's state.
       samples: [G, N, ...], zero where not valid.
       key: Random key, consumed.
-      shards: How the samples are spread over devices.
 
     Returns:
       Parameters and the optimiser's state after, and the metrics of each step, [steps].
     """
     params, state = begun
-    flat_state = _flat_state(config, updates, *begun)
+    config, shards = learning.config, learning.shards
+    flat_state = _flat_state(learning, *begun)
     layouts, arranged = fused.layouts(params), valid_first(samples)
     valid = jnp.sum(arranged.valid, dtype=jnp.int32)
     arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
@@ -72,9 +64,7 @@ def learn(
             expected_valid,
             launch=launch,
         )
-        progress, metrics = optimizer.take(
-            config, updates, progress, (gradient, metrics), taken > 0, shards
-        )
+        progress, metrics = optimizer.take(learning, progress, (gradient, metrics), taken > 0)
         return progress, jnp.stack([metrics[name] for name in METRICS])
 
     (flat, flat_state), rows = jax.lax.scan(step, (fused.flatten(params), flat_state), dealt.span)
@@ -82,11 +72,9 @@ def learn(
     return learned, dict(zip(METRICS, rows.T, strict=True))
 
 
-def _flat_state(
-    config: AlgoConfig, updates: int, params: Params, state: optax.OptState
-) -> optax.OptState:
+def _flat_state(learning: Learning, params: Params, state: optax.OptState) -> optax.OptState:
     """Converts the optimiser's state: one vector for each network instead of a tree."""
-    like = jax.eval_shape(optimizer.make(config, updates).init, fused.flatten(params))
+    like = jax.eval_shape(learning.optimizer.init, fused.flatten(params))
     return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
 
 

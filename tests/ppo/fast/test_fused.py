@@ -9,19 +9,21 @@ import chex
 import hypothesis
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import losses, networks, optimizer
+from swarmjax.ppo import gaussian, losses, optimizer
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import fused, kernel
 from swarmjax.ppo.fast.kernel import Launch
 from swarmjax.ppo.losses import Minibatch
-from swarmjax.ppo.networks import Params
+from swarmjax.ppo.networks import Networks, Params, Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 
 OBSERVATION, ACTION = 10, 2
 SMALL = AlgoConfig(hidden_sizes=(16,), entropy_cost=0.02, value_cost=0.7)
@@ -32,11 +34,17 @@ RELATIVE = 5e-5
 H100 = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=132, platform="gpu")
 
 
+def _nets(config: AlgoConfig) -> Networks:
+    return learners.nets(config, OBSERVATION, ACTION)
+
+
+def _ppo(config: AlgoConfig, backend: Backend = "fused") -> PPO:
+    return learners.ppo(config, Sizes(OBSERVATION, ACTION), 5, backend)
+
+
 def _params(config: AlgoConfig, seed: int = 0) -> Params:
     """Returns parameters without zeros; their mean actions lie inside and outside -1..1."""
-    shapes = jax.eval_shape(
-        lambda: networks.init_params(jax.random.key(0), config, OBSERVATION, ACTION)
-    )
+    shapes = jax.eval_shape(lambda: _nets(config).init(jax.random.key(0)))
     random = np.random.default_rng(seed)
     params = jax.tree.map(lambda x: 0.3 * random.normal(size=x.shape).astype(np.float32), shapes)
     # Means of equal spread for each width: a log probability L has a rounding error of about
@@ -49,8 +57,8 @@ def _params(config: AlgoConfig, seed: int = 0) -> Params:
 def _log_prob(
     params: Params, config: AlgoConfig, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
-    mean, std = networks.action_distribution(params, config, observation)
-    return networks.log_prob(mean, std, action)
+    acted = _nets(config).act(params, observation, ())
+    return gaussian.log_prob(acted.mean, acted.std, action)
 
 
 def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> Minibatch:
@@ -73,7 +81,10 @@ def _expected(params: Params, minibatch: Minibatch, config: AlgoConfig, count: f
     """Returns the gradient and the metrics of autodiff."""
     with jax.default_matmul_precision("highest"):
         gradient = jax.grad(losses.ppo_loss, has_aux=True)
-        return jax.jit(gradient, static_argnums=2)(params, minibatch, config, jnp.float32(count))
+        valid = jnp.float32(count)
+        return jax.jit(gradient, static_argnums=(2, 3))(
+            params, minibatch, _nets(config), config, valid
+        )
 
 
 @functools.partial(jax.jit, static_argnums=(2, 4))
@@ -213,17 +224,17 @@ def test_products_have_the_precision_that_jax_is_set_to(
 # Wiring
 
 
-def _batch(drawn: Minibatch, groups: int) -> ppo.Batch:
+def _batch(drawn: Minibatch, groups: int) -> Batch:
     names = ("observation", "action", "log_prob", "advantage", "return_", "valid")
     cut = {n: np.reshape(x := getattr(drawn, n), (groups, -1, *x.shape[1:])) for n in names}
-    return ppo.Batch(**cut)
+    return Batch(**cut)
 
 
 def _learn(
-    config: AlgoConfig, begun: ppo.LearnerState, batch: ppo.Batch, backend: Backend = "fused"
+    config: AlgoConfig, begun: LearnerState, batch: Batch, backend: Backend = "fused"
 ) -> Any:
     """Returns the parameters, the optimiser's state and the metrics after one update."""
-    update = jax.jit(lambda b: ppo.update(begun, config, b, jax.random.key(1), 5, backend))
+    update = jax.jit(lambda b: _ppo(config, backend).update(begun, b, jax.random.key(1)))
     made, metrics = update(batch)
     return made.params, made.optimizer_state, metrics
 
@@ -252,7 +263,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = replace(SMALL, num_minibatches=1, epochs=3)
-    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    begun = _ppo(config).init(jax.random.key(0))
     batch = _batch(_minibatch(begun.params, config, 8 * 20), 8)
     expected = _learn(config, begun, batch, "autodiff")
     calls = _interpret(monkeypatch)
@@ -264,7 +275,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = replace(SMALL, num_minibatches=4, epochs=2)
-    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    begun = _ppo(config).init(jax.random.key(0))
     drawn = _minibatch(begun.params, config, 32 * 40)
     _interpret(monkeypatch)
     found = _learn(config, begun, _batch(drawn, 32))
@@ -283,8 +294,9 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
         rows = np.concatenate([np.arange(64 * i, min(64 * i + 64, count)) for i in chosen])
         part = jax.tree.map(lambda x, rows=rows: x[rows], valid)
         gradient = jax.grad(losses.ppo_loss, has_aux=True)
-        slope = gradient(progress[0], part, config, count / 4)
-        progress, metrics = optimizer.take(config, 5, progress, slope, jnp.bool_(True))
+        slope = gradient(progress[0], part, _nets(config), config, count / 4)
+        learning = _ppo(config).learning
+        progress, metrics = optimizer.take(learning, progress, slope, jnp.bool_(True))
         told.append(metrics)
     means = jax.tree.map(lambda *x: np.mean(x), *told)
     del means["taken_steps"]
@@ -294,7 +306,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
 
 def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(SMALL, num_minibatches=4, epochs=3)
-    begun = ppo.init(jax.random.key(0), config, OBSERVATION, ACTION, 5)
+    begun = _ppo(config).init(jax.random.key(0))
     drawn = _minibatch(begun.params, config, 8 * 40)
     _interpret(monkeypatch)
     few = replace(drawn, valid=drawn.valid & (np.arange(8 * 40) < 80))  # one tile of 64
@@ -312,12 +324,12 @@ def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.Monk
     _interpret(monkeypatch)
     begun, batches = [], []
     for seed, share in enumerate((1.0, 0.4, 0.0)):
-        begun.append(ppo.init(jax.random.key(seed), config, OBSERVATION, ACTION, 5))
+        begun.append(_ppo(config).init(jax.random.key(seed)))
         drawn = _minibatch(begun[-1].params, config, 8 * 20, seed)
         batches.append(_batch(replace(drawn, valid=np.arange(8 * 20) < share * 8 * 20), 8))
 
-    def update(learner: ppo.LearnerState, batch: ppo.Batch) -> ppo.LearnerState:
-        return ppo.update(learner, config, batch, jax.random.key(3), 5, "fused")[0]
+    def update(learner: LearnerState, batch: Batch) -> LearnerState:
+        return _ppo(config).update(learner, batch, jax.random.key(3))[0]
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *zip(begun, batches, strict=True))
     together = jax.jit(jax.vmap(update))(*stacked)

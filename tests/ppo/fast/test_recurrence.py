@@ -134,13 +134,13 @@ def test_a_small_chip_has_one_step_in_flight(size: int, capability: str, steps: 
 
 
 class TestWhereTheyAreUsed:
-    """Tests of `dispatch.bind_memory`."""
+    """Tests of `dispatch.memory_kernels`."""
 
     CONFIG = AlgoConfig(memory="gru", memory_size=32)
 
     def bound(self, monkeypatch: pytest.MonkeyPatch, config: AlgoConfig, gpu: bool) -> Any:
         monkeypatch.setattr(dispatch, "_has_tensor_cores", lambda: gpu)
-        return dispatch.bind_memory(config).memory_kernels
+        return dispatch.memory_kernels(config)
 
     def test_on_a_gpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
         assert self.bound(monkeypatch, self.CONFIG, gpu=True) is recurrence

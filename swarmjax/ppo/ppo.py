@@ -1,0 +1,353 @@
+"""Proximal policy optimisation (PPO) of one learner: how it acts, values and learns.
+
+All functions are pure and handle one learner; for L learners, apply `jax.vmap` over state, batch
+and key. G stands for groups of samples, N for the samples of a group. Minibatches consist of whole
+groups.
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from swarmjax.config.section import MAX_COUNT
+from swarmjax.extension import Network
+from swarmjax.ppo import batch as batches
+from swarmjax.ppo import dispatch, exploration, gaussian, losses, networks, normalizer, optimizer
+from swarmjax.ppo.batch import Batch, Trajectory
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
+from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.memory import NO_MEMORY, Recall
+from swarmjax.ppo.networks import Params, Sizes
+from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.ppo.optimizer import Learning, Progress
+from swarmjax.shards import ALONE, Shards
+
+_ADVANTAGE_EPSILON = 1e-8
+
+
+@struct.dataclass(kw_only=True)
+class LearnerState:
+    """The complete state of a learner.
+
+    Attributes:
+      params: `{"actor": .., "critic": ..}`.
+      optimizer_state: State of the optimiser that `init` made.
+      normalizer: Moments of the valid observations of all updates so far. A learner that does not
+        normalise keeps the initial moments.
+      explored: [], int32, control steps that the schedule of exploration has counted, at most
+        2^31 - 1; None if exploration is learned.
+    """
+
+    params: Params
+    optimizer_state: optax.OptState
+    normalizer: Normalizer
+    explored: jax.Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PPO:
+    """PPO with its networks: `init`, `act`, `value` and `update`, and what they need.
+
+    Attributes:
+      learning: settings, networks and optimiser.
+      sizes: what the policy sees and does.
+      backend: how updates are computed.
+    """
+
+    learning: Learning
+    sizes: Sizes
+    backend: Backend = "autodiff"
+
+    @classmethod
+    def make(
+        cls,
+        config: AlgoConfig,
+        sizes: Sizes,
+        updates: int,
+        *,
+        pieces: Sequence[Network] = (),
+        shards: Shards = ALONE,
+        side_by_side: int = 1,
+    ) -> "PPO":
+        """Makes PPO for a policy; resolves everything that the config leaves to `auto`.
+
+        Args:
+          config: settings.
+          sizes: what the policy sees and does.
+          updates: number of updates of the whole run, at least 1; the learning rate's schedule
+            spans them.
+          pieces: networks of an extension.
+          shards: how the samples are spread over devices.
+          side_by_side: how many learners a device trains at once.
+
+        Raises:
+          ConfigError: the network is missing or does not fit, or the backend is not available.
+        """
+        nets = networks.make(config, sizes, pieces, dispatch.memory_kernels(config))
+        adam = optimizer.make(config, updates)
+        learning = Learning(config, nets, adam, shards, side_by_side)
+        return cls(learning, sizes, dispatch.resolve(config, nets, sizes))
+
+    @property
+    def config(self) -> AlgoConfig:
+        """The settings."""
+        return self.learning.config
+
+    def init(self, key: jax.Array) -> LearnerState:
+        """Makes a new learner; the random key is consumed."""
+        params = self.learning.networks.init(key)
+        scheduled = self.config.exploration == "scheduled"
+        return LearnerState(
+            params=params,
+            optimizer_state=self.learning.optimizer.init(params),
+            normalizer=normalizer.init(self.sizes.observation),
+            explored=jnp.zeros((), jnp.int32) if scheduled else None,
+        )
+
+    def begin_memory(self, shape: tuple[int, ...]) -> Recall:
+        """Returns the memory [*shape, H] of episodes that begin; () each without memory."""
+        return self.learning.networks.begin_memory(shape)
+
+    def act(
+        self, learner: LearnerState, observation: jax.Array, noise: jax.Array, memory: Any = ()
+    ) -> tuple[jax.Array, jax.Array, Any]:
+        """Draws actions.
+
+        Args:
+          learner: the learner with the policy.
+          observation: [..., O], raw.
+          noise: [..., U], standard normal; 0 gives the most likely action.
+          memory: [..., H], memory of the actor before; () without memory.
+
+        Returns:
+          The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
+          after.
+        """
+        seen = normalize(learner, observation)
+        acted = self.learning.networks.act(learner.params, seen, memory)
+        chex.assert_equal_shape([acted.mean, noise])
+        action = acted.mean + acted.std * noise
+        return action, gaussian.log_prob(acted.mean, acted.std, action), acted.memory
+
+    def value(
+        self, learner: LearnerState, observation: jax.Array, state: Any = (), memory: Any = ()
+    ) -> tuple[jax.Array, Any]:
+        """Computes the critic's values.
+
+        Args:
+          learner: the learner with the critic.
+          observation: [..., O], raw.
+          state: [..., P], numbers of order 1 that the critic sees in addition; () if there are
+            none.
+          memory: [..., H], memory of the critic before; () without memory.
+
+        Returns:
+          The expected discounted return, [...], and the memory after.
+        """
+        seen = normalize(learner, observation)
+        return self.learning.networks.value(learner.params, seen, state, memory)
+
+    def batch(self, trajectory: Trajectory, memory: Recall, over: jax.Array) -> Batch:
+        """Turns a rollout into the samples of an update, with advantages and returns.
+
+        Args:
+          trajectory: [T, A, N, ...].
+          memory: [A, N, H], memory before the rollout; () each without memory.
+          over: [T, A], whether an arena's episode ended with the step.
+
+        Returns:
+          A groups with T * N samples.
+        """
+        return batches.make(trajectory, memory, over, self.config, self.learning.shards)
+
+    def update(
+        self, learner: LearnerState, batch: Batch, key: jax.Array
+    ) -> tuple[LearnerState, Metrics]:
+        """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
+
+        The log densities in the batch were computed with the normalizer from before this update.
+        All epochs use this normalizer, so that the ratio of new to old density starts at 1. After
+        the epochs, the batch's observations are added to the normalizer. A minibatch without a
+        valid sample is skipped: it changes neither the parameters nor the learning rate's schedule.
+
+        Args:
+          learner: the learner before the update.
+          batch: G groups of N samples; `config.num_minibatches` divides G.
+          key: random key, consumed.
+
+        Returns:
+          The state after, the same on all devices, and metrics, each []. The metrics of
+          `losses.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
+          `skipped_steps` counts the steps that were not finite. `std` is the policy's mean
+          deviation after the update.
+        """
+        config, shards = self.config, self.learning.shards
+        _check(config, batch, shards)
+        counted = batch.valid.astype(bool)
+        batch = replace(batch, valid=counted & _is_finite(batch))
+        samples = _samples(learner, config, batch, shards)
+        begun = (learner.params, learner.optimizer_state)
+        learn = dispatch.find(self.backend) or _learn
+        (params, optimizer_state), metrics = learn(self.learning, begun, samples, key)
+        # Without a finite sample no step is finite either.
+        lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
+        metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
+        metrics = optimizer.mean_of_taken(metrics)
+        metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
+        moments = learner.normalizer
+        if config.normalize_observations:
+            moments = normalizer.update(moments, batch.observation, batch.valid, shards)
+            moments = _leave_neighbours(moments, self.sizes)
+        return replace(
+            learner, params=params, optimizer_state=optimizer_state, normalizer=moments
+        ), metrics
+
+    def explore(self, learner: LearnerState, steps: jax.Array | int) -> LearnerState:
+        """Moves a learner along the schedule of exploration, if there is one.
+
+        Args:
+          learner: the learner before these steps.
+          steps: [], how many control steps of all arenas follow, at least 1.
+
+        Returns:
+          The learner with the deviation of the last of these steps; unchanged if exploration is
+          learned.
+        """
+        if learner.explored is None:
+            return learner
+        # The count stays at its largest value, since a run may go on from another one's count.
+        explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
+        std = exploration.scheduled_std(self.config, explored - 1)
+        return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
+
+    def explore_anew(self, learner: LearnerState) -> LearnerState:
+        """Resets the exploration of a learner, with any leading axes, to that of a new learner."""
+        begun = _with_log_std(learner, math.log(self.config.initial_std))
+        return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
+
+
+def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerState:
+    actor = learner.params["actor"]
+    actor = actor | {"log_std": jnp.full_like(actor["log_std"], log_std)}
+    return replace(learner, params=learner.params | {"actor": actor})
+
+
+def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
+    """Normalises raw observations [..., O] for the networks, within +-10."""
+    return normalizer.normalize(learner.normalizer, observation)
+
+
+def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
+    """Leaves neighbours' entries unnormalised: they are scaled, and their order must not matter."""
+    if sizes.hearing is None:
+        return moments
+    heard = slice(sizes.hearing.first, sizes.hearing.last)
+    return replace(
+        moments,
+        mean=moments.mean.at[heard].set(0.0),
+        variance=moments.variance.at[heard].set(1.0),
+    )
+
+
+def _is_finite(batch: Batch) -> jax.Array:
+    """Tells which samples, [G, N], hold only finite numbers."""
+    numbers = (batch.log_prob, batch.advantage, batch.return_)
+    vectors = jax.tree.leaves((batch.observation, batch.action, batch.state))
+    finite = [jnp.isfinite(x) for x in numbers]
+    finite += [jnp.all(jnp.isfinite(x), axis=-1) for x in vectors]
+    return functools.reduce(jnp.logical_and, finite)
+
+
+def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
+    chex.assert_rank([batch.observation, batch.action], 3)
+    chex.assert_rank([batch.valid], 2)
+    chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_, batch.valid])
+    chex.assert_equal_shape_prefix([batch.observation, batch.action, batch.valid], 2)
+    chex.assert_is_divisible(batch.valid.shape[0], config.num_minibatches * shards.local_streams)
+
+
+def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
+    """Prepares samples for the loss, still [G, N, ...]: normalised, and zero where not valid."""
+    valid, advantage = batch.valid.astype(bool), batch.advantage
+    if config.advantage == "gae" and config.normalize_advantages:
+        advantage = _normalize_advantages(advantage, valid, shards)
+    samples = Minibatch(
+        observation=normalize(learner, batch.observation),
+        action=batch.action,
+        log_prob=batch.log_prob,
+        advantage=advantage,
+        return_=batch.return_,
+        valid=valid,
+        state=batch.state,
+    )
+    # Otherwise a NaN in an invalid sample would spread through the networks into every gradient.
+    masked = jax.tree.map(
+        lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
+    )
+    memory = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), batch.memory)
+    return replace(masked, memory=memory, begins=batch.begins)
+
+
+def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:
+    """Scales advantages to mean 0 and standard deviation 1 over the valid samples, [G, N]."""
+    count = jnp.maximum(shards.sum(jnp.sum(valid)), 1)
+    mean = shards.sum(jnp.sum(jnp.where(valid, advantage, 0.0))) / count
+    variance = shards.sum(jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0))) / count
+    return (advantage - mean) / (jnp.sqrt(variance) + _ADVANTAGE_EPSILON)
+
+
+def _learn(
+    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
+) -> tuple[Progress, Metrics]:
+    """Runs all epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
+    config, shards = learning.config, learning.shards
+    expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
+
+    def step(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
+        minibatch = _gather(samples, rows, config)
+        gradient = jax.grad(losses.ppo_loss, has_aux=True)(
+            progress[0], minibatch, learning.networks, config, expected_valid
+        )
+        return optimizer.take(learning, progress, gradient, jnp.any(minibatch.valid))
+
+    def epoch(progress: Progress, key: jax.Array) -> tuple[Progress, Metrics]:
+        # Whole groups are shuffled, because they are faster to gather than single samples.
+        order = _shuffle(key, samples.valid.shape[0], config.num_minibatches, shards)
+        return jax.lax.scan(step, progress, order)
+
+    return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
+
+
+def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatch:
+    """Takes whole groups [G, N, ...] as samples [B, ...], ordered by step if there is a memory."""
+    if not jax.tree.leaves(samples.memory):
+        return jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
+
+    def by_step(x: jax.Array) -> jax.Array:
+        sequences = x[rows].reshape(len(rows), config.rollout_length, -1, *x.shape[2:])
+        return jnp.moveaxis(sequences, 1, 0).reshape(-1, *x.shape[2:])
+
+    memory = jax.tree.map(lambda x: x[rows].reshape(-1, x.shape[-1]), samples.memory)
+    flat = jax.tree.map(by_step, replace(samples, memory=NO_MEMORY))
+    return replace(flat, memory=memory)
+
+
+def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
+    """Deals this device's groups [G] out to M minibatches, [M, G / M], each stream by itself."""
+    streams = shards.local_streams
+    size = groups // streams
+
+    def order(key: jax.Array) -> jax.Array:
+        return jax.random.permutation(key, size).reshape(minibatches, -1)
+
+    first = size * jnp.arange(streams)
+    return shards.draw(key, order, axis=1) + jnp.repeat(first, size // minibatches)

@@ -1,0 +1,23 @@
+"""PPO and networks for tests, of settings and sizes alone."""
+
+from dataclasses import replace
+from functools import cache
+
+from swarmjax.ppo import networks
+from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.dispatch import Backend
+from swarmjax.ppo.networks import Networks, Sizes
+from swarmjax.ppo.ppo import PPO
+
+
+@cache
+def ppo(config: AlgoConfig, sizes: Sizes, updates: int = 10, backend: Backend | None = None) -> PPO:
+    """Returns PPO; without a backend, what the config chooses."""
+    made = PPO.make(config, sizes, updates)
+    return made if backend is None else replace(made, backend=backend)
+
+
+@cache
+def nets(config: AlgoConfig, observation: int, action: int, state: int = 0) -> Networks:
+    """Returns actor and critic."""
+    return networks.make(config, Sizes(observation, action, state))
