@@ -95,7 +95,7 @@ def drive(settings: GalleryConfig, cell: Cell, who: str | None) -> tuple[Level, 
     judge = evaluate_judge.load(mine, trained, cell.half)
     level = cells.split(cell.levels)[settings.level]
     arenas = engine_c.start(judge, [level])
-    driver = (baselines.controller(who, judge) if who else None) or engine_c.by_policy(judge)
+    driver = (baselines.controller(who, judge) if who else None) or engine_c.ByPolicy(judge)
     memory, frames = driver.init(arenas), [_frame(arenas)]
     for step in range(1, settings.steps + 1):
         memory, action = driver.act(memory, arenas)

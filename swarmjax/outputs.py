@@ -7,7 +7,7 @@ replaces the file only if the digest still matches, or if it is told to overwrit
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -109,6 +109,24 @@ def note(paths: Iterable[Path]) -> None:
         found = _notes(path.parent) | {path.name: _digest(path)}
         with replacing(path.parent / NOTES) as temporary:
             temporary.write_text(json.dumps(found, indent=2, sort_keys=True) + "\n")
+
+
+def write(files: Mapping[Path, bytes]) -> None:
+    """Writes the files that the key `out` names, each completely or not at all, and notes them.
+
+    Args:
+      files: contents by path; missing folders are made.
+
+    Raises:
+      ConfigError: if a file cannot be written.
+    """
+    for path, content in files.items():
+        try:
+            with replacing(path) as temporary:
+                temporary.write_bytes(content)
+            note([path])
+        except OSError as error:
+            raise unwritable("out", path, error) from None
 
 
 def _digest(path: Path) -> str | None:

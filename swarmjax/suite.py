@@ -1,7 +1,7 @@
 """`python -m swarmjax.suite suite=NAME [out=FILE]`: draws the levels of a suite.
 
 The levels are checked against the digests in the suite's file. `write=true` writes new digests into
-it. With `policies`, each cell gets the levels of a pool that these policies fail most.
+it.
 """
 
 import json
@@ -9,8 +9,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +17,6 @@ import numpy as np
 import yaml
 from rich import box
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from swarmjax import command, outputs
@@ -26,11 +24,9 @@ from swarmjax.config import ConfigError, about, files, reading
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
-from swarmjax.evaluate.config import MOST_STEPS, STEPS, EvaluateConfig
-from swarmjax.evaluate.evaluation import list_files
-from swarmjax.evaluate.suite_config import CellConfig, read_suite
+from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
-from swarmjax.evaluate.trials import Entrant, Trial
 from swarmjax.outputs import OVERWRITE, replacing
 
 _WIDTH = 100  # columns of a suite's file
@@ -47,51 +43,13 @@ class SuiteConfig(Section):
     overwrite: bool = field(default=False, metadata=OVERWRITE)
     write: bool = field(
         default=False,
-        metadata=about("write digests, and chosen episodes, into the suite's file"),
+        metadata=about("write digests into the suite's file"),
     )
-    policies: str | None = field(
-        default=None,
-        metadata=about("choose the levels that these policies fail most: a.npz,b.npz or a pattern"),
-    )
-    pool: int = field(default=20_000, metadata=about("levels drawn to choose from", 1, 1_000_000))
-    steps: int | None = field(
-        default=None,
-        metadata=about(
-            f"control steps of an episode; null: as in the cell, else {STEPS}", 1, MOST_STEPS
-        ),
-    )
-    workers: int | None = field(
-        default=None, metadata=about("processes; null: one per core", 1, 1024)
-    )
-
-
-def choose(trial: Trial, count: int) -> np.ndarray:
-    """Chooses the levels that policies fail most.
-
-    Args:
-      trial: Trial of one or more policies on a pool of levels.
-      count: Number of levels to choose, at most the size of the pool.
-
-    Returns:
-      Their numbers [count], rising. Levels with the fewest reached targets are chosen first.
-      Ties go to the level with the most contacts, then to the slowest, then to the first.
-    """
-    reached, contacts, time = (
-        trial.found[name].mean(axis=0)
-        for name in ("targets_reached", "contacts_per_robot", "time_to_reach_s")
-    )
-    worst = np.lexsort((trial.cell.episodes, -time, -contacts, reached))[:count]
-    return np.sort(trial.cell.episodes[worst])
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(SuiteConfig, arguments)
-    if settings.policies is not None and not settings.write:
-        raise ConfigError(
-            "policies is given, but write is false: give write=true, which puts the levels that "
-            "are chosen into the suite's file."
-        )
     if settings.out is not None and Path(settings.out).suffix != ".npz":
         raise ConfigError(f"out is {reading.called(settings.out)}: give a file .npz.")
     out = [] if settings.out is None else [Path(settings.out)]
@@ -110,51 +68,17 @@ def main(arguments: Sequence[str]) -> int:
 def _renew(settings: SuiteConfig) -> Suite:
     """Draws a suite without checking its digests, and writes the new digests into its file."""
     file = read_suite(settings.suite)
-    wanted = file.cells
-    if settings.policies is not None:
-        entrants = trials.read_policies(list_files("policies", settings.policies))
-        wanted = tuple(_search(settings, each, entrants) for each in wanted)
-    suite = Suite(file.name, tuple(cells.draw_cell(each) for each in wanted))
+    suite = Suite(file.name, tuple(map(cells.draw_cell, file.cells)))
     path = files.named_path("suites", settings.suite, "suite")
     content = files.read_yaml(path)
-    for entry, cell, chosen in zip(content["cells"], suite.cells, wanted, strict=True):
+    for entry, cell in zip(content["cells"], suite.cells, strict=True):
         entry["digest"] = cell.digest
-        if chosen.episodes:
-            entry["episodes"] = list(chosen.episodes)
-    _replace(path, _comment(path) + to_yaml(content))
-    return suite
-
-
-def _replace(path: Path, text: str) -> None:
-    """Replaces the text of a file, whole or not at all."""
     try:
         with replacing(path) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(_comment(path) + to_yaml(content))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
-
-
-def _search(settings: SuiteConfig, cell: CellConfig, entrants: Sequence[Entrant]) -> CellConfig:
-    """Gives a cell the levels of a pool that policies fail most."""
-    if settings.pool < cell.levels:
-        raise ConfigError(
-            f"pool is {settings.pool}, but cell {cell.name} takes {cell.levels} levels: give more."
-        )
-    pool = cells.draw_cell(replace(cell, levels=settings.pool, episodes=(), digest=None))
-    judged = EvaluateConfig(
-        policy=settings.policies,
-        stage=cell.stage,
-        action="mean",  # a level should not depend on lucky draws
-        steps=settings.steps,
-        workers=settings.workers,
-    )
-    progress = Progress(console=Console(stderr=True), transient=True)
-    progress.disable = not progress.console.is_terminal
-    with progress:
-        bar = progress.add_task(cell.name, total=settings.pool * len(entrants))
-        (trial,) = trials.run(judged, [pool], entrants, partial(progress.advance, bar))
-    chosen = choose(trial, cell.levels)
-    return replace(cell, episodes=tuple(chosen.tolist()), digest=None)
+    return suite
 
 
 def _comment(path: Path) -> str:

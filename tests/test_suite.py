@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import steering
 import yaml
@@ -12,11 +11,7 @@ import yaml
 from swarmjax import command, suite
 from swarmjax.config import files
 from swarmjax.evaluate import cells
-from swarmjax.evaluate.cells import Cell
-from swarmjax.evaluate.suite_config import read_suite
-from swarmjax.evaluate.trials import Trial
 from swarmjax.suite import SuiteConfig
-from swarmjax.task.stage_config import StageConfig
 
 TEXT = """# What it is,
 # in two lines.
@@ -93,40 +88,6 @@ def test_a_friction_of_hulls_is_listed_and_refused_as_that_of_a_robot(
     assert "hull_friction is 0.01" in capsys.readouterr().err
 
 
-def test_the_levels_that_policies_fail_most_are_chosen() -> None:
-    found: dict[str, Any] = {
-        "targets_reached": [[1.0, 0.5, 0.5, 0.5, 0.0], [1.0, 0.5, 0.5, 0.5, 1.0]],
-        "contacts_per_robot": [[9.0, 1.0, 2.0, 1.0, 0.0], [9.0, 1.0, 2.0, 1.0, 0.0]],
-        "time_to_reach_s": [[9.0, 4.0, 1.0, 5.0, 0.0], [9.0, 4.0, 1.0, 5.0, 0.0]],
-    }
-    stage: Any = StageConfig(name="s", robots=1, side=1.0)
-    levels: Any = None
-    cell = Cell("x", stage, "box", None, 1_000_000, np.array([10, 11, 12, 13, 14]), levels)
-    tables = {name: np.array(table) for name, table in found.items()}
-    trial = Trial(cell, np.zeros((5, 1)), tables, np.zeros((2, 5, 1)))
-    # All levels but the first reach half of their targets on average. These levels are ordered by
-    # most contacts, then by longest time, then by lowest number.
-    assert suite.choose(trial, 1).tolist() == [12]
-    assert suite.choose(trial, 2).tolist() == [12, 13]
-    assert suite.choose(trial, 3).tolist() == [11, 12, 13]
-    assert suite.choose(trial, 4).tolist() == [11, 12, 13, 14]
-
-
-def test_chosen_levels_are_written_with_their_numbers(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    policy = steering.write(tmp_path / "policy.npz")
-    words = (f"suite={file}", f"policies={policy}", "pool=6", "steps=60", "workers=1")
-    assert _command(monkeypatch, *words, "write=true") == 0
-    found = read_suite(str(file)).cells
-    for cell, count in zip(found, (2, 3), strict=True):
-        assert len(cell.episodes) == count
-        assert set(cell.episodes) < set(range(6))
-        assert list(cell.episodes) == sorted(cell.episodes)
-    assert [len(cell.episodes) for cell in cells.draw(str(file)).cells] == [2, 3]
-    assert file.read_text().startswith("# What it is,\n# in two lines.\n")
-
-
 def test_a_write_that_fails_leaves_the_file(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fill(path: Path, text: str) -> None:
         with path.open("w") as half:
@@ -187,9 +148,6 @@ def test_a_written_suite_reads_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["policies=a.npz"], "policies is given, but write is false: give write=true"),
-        (["policies={tmp}/no.npz", "write=true"], "{tmp}/no.npz "),
-        (["policies={tmp}/p.npz", "write=true", "pool=1"], "pool is 1, but cell one takes 2 "),
         (["out={tmp}/x.csv"], "out is {tmp}/x.csv: give a file .npz."),
         (["write=true", "out={tmp}/tiny.yaml/x.npz"], "{tmp}/tiny.yaml/x.npz cannot be written: "),
         (["level=1"], "level is not a key"),

@@ -45,8 +45,7 @@ def main(arguments: Sequence[str]) -> int:
         return INTERRUPTED
     if out is not None and keep is not None:
         limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
-        _write(out, found, max(limits) * settings.task.control_step)
-        outputs.note(path for path in _files(out) if path.exists())
+        outputs.write(_content(out, found, max(limits) * settings.task.control_step))
         unfinished.remove(keep)
     console = Console()
     if not console.is_terminal:
@@ -82,22 +81,19 @@ def _files(out: Path) -> list[Path]:
     return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
-def _write(path: Path, found: Evaluation, limit: float) -> None:
-    """Writes a JSON file, or a folder with all outputs; `limit` is an episode's length, s."""
-    text = json.dumps(found.result, indent=2, allow_nan=False) + "\n"
-    try:
-        if path.suffix == ".json":
-            path.write_text(text)
-            return
-        (path / "result.json").write_text(text)
-        evaluate_table.write_levels(path / "levels.csv", found.entrants, found.trials)
-        if "policies" in found.result:
-            from swarmjax.evaluate import figures  # Matplotlib takes a second to import
+def _content(out: Path, found: Evaluation, limit: float) -> dict[Path, bytes]:
+    """Makes the JSON file, or all files of a folder; `limit` is an episode's length, s."""
+    text = (json.dumps(found.result, indent=2, allow_nan=False) + "\n").encode()
+    if out.suffix == ".json":
+        return {out: text}
+    levels = evaluate_table.levels(found.entrants, found.trials)
+    files = {"result.json": text, "levels.csv": levels.encode()}
+    if "policies" in found.result:
+        from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
-            for name, content in figures.draw(found.result, found.trials, limit).items():
-                (path / f"{name}.png").write_bytes(content)
-    except OSError as error:
-        raise outputs.unwritable("out", path, error) from None
+        drawn = figures.draw(found.result, found.trials, limit)
+        files |= {f"{name}.png": content for name, content in drawn.items()}
+    return {out / name: content for name, content in files.items()}
 
 
 if __name__ == "__main__":

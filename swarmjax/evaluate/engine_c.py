@@ -9,7 +9,6 @@ result does not depend on how the work is split up.
 """
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -18,7 +17,8 @@ import numpy as np
 
 from swarmjax import policy
 from swarmjax.config import ConfigError
-from swarmjax.evaluate import measures, rays
+from swarmjax.evaluate import contacts, measures, rays
+from swarmjax.evaluate.contacts import Pushes
 from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.judge import draw_level as draw_level
 from swarmjax.evaluate.judge import load as load
@@ -81,34 +81,25 @@ class Controller(Protocol):
         ...
 
 
-class _ByPolicy(NamedTuple):
-    """The default controller of a judge: its policy."""
+class ByPolicy(NamedTuple):
+    """The controller that follows a judge's policy; its draws depend only on level and clock."""
 
     judge: Judge
 
     def init(self, arenas: Arenas) -> np.ndarray | None:
+        """Returns the policy's memory at the start."""
         return policy.begin(self.judge.policy, arenas.pose.shape[:2])
 
     def act(
         self, memory: np.ndarray | None, arenas: Arenas
     ) -> tuple[np.ndarray | None, np.ndarray]:
+        """Returns the memory after this control step, and the policy's actions."""
         normal: Any = 0.0
         if self.judge.config.action == "sampled":
             shape = (arenas.pose.shape[1], self.judge.policy.log_std.shape[1])
             clock = arenas.outcome.clock
             normal = noise.normal(arenas.seed, clock, Stream.ACTION, shape, np)
         return policy.step(self.judge.policy, memory, arenas.observation, normal)
-
-
-def by_policy(judge: Judge) -> Controller:
-    """Returns a controller that follows the judge's policy.
-
-    Its random draws depend only on the level and the clock.
-
-    Args:
-      judge: Data that the arenas share.
-    """
-    return _ByPolicy(judge)
 
 
 def simulate(
@@ -130,7 +121,7 @@ def simulate(
       ConfigError: The physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
-    driver = by_policy(judge) if controller is None else controller
+    driver = controller or ByPolicy(judge)
     memory = driver.init(arenas)
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
     for _ in range(judge.config.step_limit):
@@ -292,13 +283,13 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
         if judge.policy.carried:
-            raise PolicyError("the policy has a memory: pass the action that `by_policy` chooses.")
-        _, action = by_policy(judge).act(None, arenas)
+            raise PolicyError("the policy has a memory: pass the action that `ByPolicy` chooses.")
+        _, action = ByPolicy(judge).act(None, arenas)
     active = arrival.drives(task.arrival, before)
     memory, pose, impulse = _drive(judge, arenas, action[..., : sim_drive.COMMAND_SIZE], active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
-    touches = touching(judge, arenas.data)
+    touches = contacts.touching(judge, arenas.data)
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
@@ -399,7 +390,7 @@ def _drive(
     wheels = np.where(active[..., None], wheels, 0.0)
     body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
     ctrl = body.ctrl(wheels, electronics.chassis(arenas.factors), robot, np)
-    pushes: list[_Pushes] = []
+    pushes: list[Pushes] = []
     for each in zip(arenas.model, arenas.data, ctrl, strict=True):
         pushes += _advance(judge, *each)
     qpos = np.stack([data.qpos for data in arenas.data])
@@ -408,22 +399,12 @@ def _drive(
             "the physics broke down, with positions that are not finite: give more than "
             f"{judge.substeps} substeps, or a robot closer to the real one."
         )
-    return memory, body.pose(qpos, np), _impulses(judge, pushes, len(arenas.data))
-
-
-class _Pushes(NamedTuple):
-    """The N pushing contacts of an arena in a physics step.
-
-    Their geoms are [N, 2], and their normal forces [N] are in newtons.
-    """
-
-    geom: np.ndarray
-    force: np.ndarray
+    return memory, body.pose(qpos, np), contacts.impulses(judge, pushes, len(arenas.data))
 
 
 def _advance(
     judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray
-) -> list[_Pushes]:
+) -> list[Pushes]:
     """Moves one arena by a control step; returns the contacts of each physics step."""
     data.ctrl = ctrl
     pushes = []
@@ -432,74 +413,9 @@ def _advance(
     # contacts.
     for _ in range(judge.substeps):
         mujoco.mj_step2(model, data)
-        pushes.append(_push(model, data))
+        pushes.append(contacts.push(model, data))
         mujoco.mj_step1(model, data)
     return pushes
-
-
-def _push(model: mujoco.MjModel, data: mujoco.MjData) -> _Pushes:
-    """Reads the normal forces of all contacts from the solver's rows.
-
-    A contact without friction has one row, its normal force. With an elliptic cone the first row is
-    the normal force. With a pyramid, all edges push along the normal, and the sum of their forces
-    is the normal force.
-    """
-    contact = data.contact
-    # MuJoCo lists a contact at a distance of exactly 0, but does not solve for it.
-    solved = contact.efc_address >= 0
-    address, edges = contact.efc_address[solved], 2 * (contact.dim[solved] - 1)
-    if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
-        edges = np.zeros_like(edges)
-    force = data.efc_force[address]
-    for k in range(1, np.max(edges, initial=0)):
-        more = edges > k
-        force[more] += data.efc_force[address[more] + k]
-    return _Pushes(contact.geom[solved], force)
-
-
-def _impulses(judge: Judge, pushes: list[_Pushes], arenas: int) -> np.ndarray:
-    """Sums the impulses of contacts, [A, R, 3] N s, in the order of `gaps.KINDS`.
-
-    Args:
-      judge: Data that the arenas share.
-      pushes: [A * substeps], grouped by arena.
-      arenas: A.
-
-    Returns:
-      [A, R, 3]; when two robots touch each other, the impulse counts for both.
-    """
-    counts = [len(each.force) for each in pushes]
-    arena = np.repeat(np.arange(len(pushes)) // judge.substeps, counts)
-    first, second = np.concatenate([each.geom for each in pushes]).T
-    force = np.concatenate([each.force for each in pushes])
-    shape = (arenas, judge.spacing.robots, len(gaps.KINDS))
-    total = np.zeros(math.prod(shape))
-    for mine, other in ((first, second), (second, first)):
-        hull = np.flatnonzero(judge.geom_robot[mine] >= 0)
-        where = (arena[hull], judge.geom_robot[mine[hull]], judge.geom_kind[other[hull]])
-        flat = np.ravel_multi_index(where, shape)
-        total += np.bincount(flat, weights=force[hull], minlength=len(total))
-    return total.reshape(shape) * judge.model.opt.timestep
-
-
-def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
-    """Tells which robots touch anything, from MuJoCo's contacts.
-
-    Args:
-      judge: Data that the arenas share.
-      data: [A] of `MjData`, positions up to date.
-
-    Returns:
-      [A, R, 3] bool, in the order of `gaps.KINDS`.
-    """
-    pairs = [each.contact.geom for each in data]
-    arena = np.repeat(np.arange(len(data)), [len(pair) for pair in pairs])
-    first, second = np.concatenate(pairs).T
-    found = np.zeros((len(data), judge.spacing.robots, len(gaps.KINDS)), bool)
-    for mine, other in ((first, second), (second, first)):
-        hull = judge.geom_robot[mine] >= 0
-        found[arena[hull], judge.geom_robot[mine[hull]], judge.geom_kind[other[hull]]] = True
-    return found
 
 
 def look(

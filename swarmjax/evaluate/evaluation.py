@@ -91,18 +91,17 @@ def _judge(
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
     judged = unfinished.about(settings, suite.cells, entrants) if keep else {}
-    found = unfinished.read(keep, judged, suite.cells) if keep else {}
-    announce(len(found), len(suite.cells))
-    report, report_cell = _show_bars(progress, suite.cells, found, len(entrants))
-    missing = [row for row in range(len(suite.cells)) if row not in found]
-    left = [suite.cells[row] for row in missing]
-    for number, trial in evaluate_trials.run_each(settings, left, entrants, report):
-        row = missing[number]
-        found[row] = trial
+    done = unfinished.read(keep, judged, suite.cells) if keep else {}
+    announce(len(done), len(suite.cells))
+    report, report_cell = _show_bars(progress, suite.cells, done, len(entrants))
+    left = {row: cell for row, cell in enumerate(suite.cells) if row not in done}
+    trials = evaluate_trials.run(settings, list(left.values()), entrants, report)
+    for row, trial in zip(left, trials, strict=True):
+        done[row] = trial
         if keep:
             unfinished.write(keep, judged, row, trial)
         report_cell(1)
-    trials = [found[row] for row in range(len(suite.cells))]
+    trials = [done[row] for row in range(len(suite.cells))]
     return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
 
 

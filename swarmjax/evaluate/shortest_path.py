@@ -72,15 +72,12 @@ class _Arena(NamedTuple):
       outline: V points around the boxes, clear of all boxes and walls.
       legs: [V, V] lengths of the straight lines between these points, m; inf if blocked, NaN if
         not yet tested. `_are_free` fills it in.
-      part: [V] numbers, equal for points that free lines connect; -1 if not yet known. `_divide`
-        fills it in.
     """
 
     inside: float
     boxes: _Boxes
     outline: _Points
     legs: np.ndarray
-    part: np.ndarray
 
 
 def shortest(
@@ -128,7 +125,7 @@ def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
     boxes = _Boxes(box, box[:, 3:].T, hull - _SLACK)
     outline = _free(_see(_outlines(box, hull).reshape(-1, 2), boxes), boxes, inside)
     count = len(outline.place)
-    return _Arena(inside, boxes, outline, np.full((count, count), np.nan), np.full(count, -1))
+    return _Arena(inside, boxes, outline, np.full((count, count), np.nan))
 
 
 def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> float:
@@ -143,44 +140,13 @@ def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> 
     circle = _free(_see(_circle(target, reach, arena.inside), boxes), boxes, arena.inside)
     around = np.linalg.norm(place - start, axis=-1)
     around += np.maximum(np.linalg.norm(target - place, axis=-1) - reach, 0.0)
-    most = _DETOUR * max(math.dist(start, target), reach)
-    length = _way_through(arena, np.flatnonzero(around <= most), begin, circle, target, reach)
-    if math.isinf(length) and not _is_joined(arena, begin, circle, target, reach):
-        return math.inf
-    while length > most:
-        most = min(length + _SLACK, 2.0 * most)
-        length = _way_through(arena, np.flatnonzero(around <= most), begin, circle, target, reach)
+    most, length = _DETOUR * max(math.dist(start, target), reach), math.inf
+    for each in (most, math.inf):
+        rows = np.flatnonzero(around <= min(each, length + _SLACK))
+        length = _way_through(arena, rows, begin, circle, target, reach)
+        if length <= most:
+            break
     return length
-
-
-def _is_joined(
-    arena: _Arena, begin: _Points, circle: _Points, target: np.ndarray, reach: float
-) -> bool:
-    """Tells whether any path leads from start to target; faster than finding the shortest."""
-    _divide(arena)
-    seen = arena.part[np.isfinite(_legs(arena.boxes, _fan(begin, arena.outline)))]
-    points = _join(begin, _take(arena.outline, np.isin(arena.part, seen)))
-    if np.isfinite(_straight(arena, points, target, reach)).any():
-        return True
-    row, column = np.indices((len(points.place), len(circle.place))).reshape(2, -1)
-    return bool(np.isfinite(_legs(arena.boxes, _Lines(points, row, circle, column))).any())
-
-
-def _divide(arena: _Arena) -> None:
-    """Finds which points of an arena are connected, unless that is known."""
-    for first in range(len(arena.part)):
-        if arena.part[first] < 0:
-            _flood(arena, first)
-
-
-def _flood(arena: _Arena, first: int) -> None:
-    """Gives a point's number to all points that are connected to this point."""
-    arena.part[first], waiting = first, [first]
-    while waiting:
-        here, others = waiting.pop(), np.flatnonzero(arena.part < 0)
-        others = others[_are_free(arena, here, others)]
-        arena.part[others] = first
-        waiting += others.tolist()
 
 
 def _way_through(

@@ -1,15 +1,14 @@
 """Tables of an evaluation, for a terminal and, level by level, as CSV."""
 
 import csv
+import io
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from swarmjax.config import ConfigError
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.trials import Entrant, Trial
 
@@ -138,26 +137,19 @@ def _number(value: float, measure: Measure, sign: str = "") -> str:
     return f"{value:{sign}.1f}" if measure.unit == "s" else f"{value:{sign}.3f}"
 
 
-def write_levels(path: Path, entrants: Sequence[Entrant], trials: Sequence[Trial]) -> None:
-    """Writes a row for each policy and level.
+def levels(entrants: Sequence[Entrant], trials: Sequence[Trial]) -> str:
+    """Makes a CSV file with a row for each policy and level.
 
     Args:
-      path: Path of the CSV file.
       entrants: The policies, in the order of the trials' rows.
       trials: Their results, one for each cell.
-
-    Raises:
-      ConfigError: The file cannot be written.
     """
-    names = [name for name in MEASURES if name in trials[0].found]
-    try:
-        with path.open("w", newline="") as file:
-            rows = csv.writer(file, lineterminator="\n")
-            rows.writerow(["cell", "episode", "policy", "unreachable", *names])
-            for trial in trials:
-                rows.writerows(_rows(entrants, trial, names))
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
+    names, text = [name for name in MEASURES if name in trials[0].found], io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(["cell", "episode", "policy", "unreachable", *names])
+    for trial in trials:
+        rows.writerows(_rows(entrants, trial, names))
+    return text.getvalue()
 
 
 def _rows(

@@ -4,10 +4,10 @@ import math
 import os
 import signal
 import threading
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import batched, islice
 from multiprocessing import get_context, parent_process
 from typing import NamedTuple
 
@@ -60,8 +60,8 @@ class _Job(NamedTuple):
     find_ways: bool
 
 
-# The row of a cell, the outcome of each policy on it, and the lengths of its shortest paths.
-type _Result = tuple[int, list[Outcome], np.ndarray]
+# The outcome of each policy on a cell, and the lengths of the cell's shortest paths.
+type _Result = tuple[list[Outcome], np.ndarray]
 
 
 def read_policies(files: Sequence[str], extensions: str | None = None) -> list[Entrant]:
@@ -82,7 +82,7 @@ def run(
     cells: Sequence[Cell],
     entrants: Sequence[Entrant],
     report: Callable[[int], None] = lambda _: None,
-) -> list[Trial]:
+) -> Iterator[Trial]:
     """Judges policies on cells.
 
     Args:
@@ -91,33 +91,8 @@ def run(
       entrants: The policies.
       report: Called from time to time with the number of episodes finished since the last call.
 
-    Returns:
-      A trial for each cell.
-
-    Raises:
-      PolicyError: A policy does not fit a cell.
-      ConfigError: The physics breaks down.
-    """
-    found = dict(run_each(config, cells, entrants, report))
-    return [found[row] for row in range(len(cells))]
-
-
-def run_each(
-    config: EvaluateConfig,
-    cells: Sequence[Cell],
-    entrants: Sequence[Entrant],
-    report: Callable[[int], None] = lambda _: None,
-) -> Iterator[tuple[int, Trial]]:
-    """Judges policies on cells as `run` does, and yields each trial as soon as it is finished.
-
-    Args:
-      config: Settings of the evaluation.
-      cells: Cells with the levels.
-      entrants: The policies.
-      report: Called from time to time with the number of episodes finished since the last call.
-
     Yields:
-      The row of a cell, and the results of the policies on it.
+      A trial for each cell, as soon as it is finished.
 
     Raises:
       PolicyError: A policy does not fit a cell.
@@ -129,8 +104,9 @@ def run_each(
     # Checks all cells before the first one runs.
     configs = [specialise(config, cell) for cell in cells]
     play = _by_mjx if config.engine == "mjx" else _by_c
-    for row, outcomes, shortest in play(config, cells, entrants, report):
-        yield row, _try(configs[row], cells[row], outcomes, shortest)
+    played = play(config, cells, entrants, report)
+    for mine, cell, (outcomes, shortest) in zip(configs, cells, played, strict=True):
+        yield _try(mine, cell, outcomes, shortest)
 
 
 def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> EvaluateConfig:
@@ -188,21 +164,17 @@ def _by_mjx(
     from swarmjax.evaluate import engine_mjx
     from swarmjax.run import compile_cache  # these modules need JAX
 
-    for row, cell in enumerate(cells):
+    for cell in cells:
         mine, outcomes = specialise(config, cell, entrants[0].path), []
         with compile_cache.use(compile_cache.AUTO):
             world = engine_mjx.load(mine, cell.largest_half, len(cell.episodes))
             for each in entrants:
-                found = engine_mjx.play(
-                    world,
-                    cell.levels,
-                    each.policy,
-                    mine.step_limit,
-                    sampled=config.action == "sampled",
+                sampled, steps = config.action == "sampled", mine.step_limit
+                outcomes.append(
+                    engine_mjx.play(world, cell.levels, each.policy, steps, sampled=sampled)
                 )
-                outcomes.append(found)
                 report(len(cell.episodes))
-        yield row, outcomes, ways(mine, cell.levels)
+        yield outcomes, ways(mine, cell.levels)
 
 
 def _by_c(
@@ -214,32 +186,31 @@ def _by_c(
     """Runs all episodes in batches, in as many processes as are useful."""
     workers = config.workers or provenance.cores()
     jobs = [
-        (row, job)
-        for row, cell in enumerate(cells)
-        for i, each in enumerate(entrants)
-        for job in _jobs(config, cell, each, workers, find_ways=not i)
+        [
+            job
+            for i, each in enumerate(entrants)
+            for job in _jobs(config, cell, each, workers, find_ways=not i)
+        ]
+        for cell in cells
     ]
-    left = Counter(row for row, _ in jobs)
-    parts: dict[int, dict[int, tuple[Outcome, np.ndarray | None]]] = defaultdict(dict)
-    for number, part in work_each(_simulate, [job for _, job in jobs], min(workers, len(jobs))):
-        row = jobs[number][0]
-        parts[row][number] = part
-        left[row] -= 1
-        report(len(part[0].clock))
-        if not left[row]:
-            mine = parts.pop(row)
-            yield row, *_put_together([mine[each] for each in sorted(mine)], len(entrants))
+    every = [job for mine in jobs for job in mine]
+    done = work(_simulate, every, min(workers, len(every)))
+    for mine in jobs:
+        parts = []
+        for part in islice(done, len(mine)):
+            parts.append(part)
+            report(len(part[0].clock))
+        yield _put_together(parts, len(entrants))
 
 
 def _put_together(
     parts: Sequence[tuple[Outcome, np.ndarray | None]], policies: int
 ) -> tuple[list[Outcome], np.ndarray]:
     """Joins the batches of a cell, policy by policy."""
-    size = len(parts) // policies
     outcomes = [outcome for outcome, _ in parts]
-    found = [outcomes[first : first + size] for first in range(0, len(parts), size)]
     lengths = [lengths for _, lengths in parts if lengths is not None]
-    whole = [Outcome(*map(np.concatenate, zip(*mine, strict=True))) for mine in found]
+    by_policy = batched(outcomes, len(parts) // policies)
+    whole = [Outcome(*map(np.concatenate, zip(*mine, strict=True))) for mine in by_policy]
     return whole, np.concatenate(lengths)
 
 
@@ -264,33 +235,11 @@ def work[Job, Result](
       jobs: Its arguments.
       workers: Number of processes; 1 means this process alone.
     """
-    if workers == 1:
+    if workers <= 1:
         yield from map(function, jobs)
         return
     with ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker) as pool:
         yield from pool.map(function, jobs)
-
-
-def work_each[Job, Result](
-    function: Callable[[Job], Result], jobs: Sequence[Job], workers: int
-) -> Iterator[tuple[int, Result]]:
-    """Runs jobs, and yields the number and the result of each as soon as it is done.
-
-    Args:
-      function: Function of a module, so that other processes find it.
-      jobs: Arguments of the function for each call; the calls are begun in order.
-      workers: Number of processes; 1 means this process alone.
-    """
-    if workers <= 1:
-        yield from enumerate(map(function, jobs))
-        return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
-    try:
-        numbers = {pool.submit(function, job): number for number, job in enumerate(jobs)}
-        for each in as_completed(numbers):
-            yield numbers.pop(each), each.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _begin_worker() -> None:

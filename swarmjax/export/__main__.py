@@ -17,7 +17,6 @@ from swarmjax import command, outputs, policy_file
 from swarmjax.config import ConfigError, files
 from swarmjax.evaluate import witness
 from swarmjax.export import c, check, onnx, webots
-from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError
@@ -86,7 +85,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
 
 
 def _check_free(settings: ExportConfig, paths: Iterable[Path]) -> None:
-    """Refuses to replace files of other origin; `export_folder` checks folders.
+    """Refuses to replace files of other origin; `convert` checks those of a folder.
 
     A run's own policy is replaced, which training has written.
     """
@@ -130,18 +129,21 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     """
     meta, content = policy_file.read_meta(source), source.read_bytes()
     if settings.format == "npz":
-        export_folder.write_file(out, content)
+        outputs.write({out: content})
         return
     witness.trained(meta, str(source))  # refuses numbers that the archive's reader leaves unchecked
     check.expressible(meta, settings.format, settings.sensors)
     trained = policy_file.read(source)
     if settings.format == "onnx":
-        export_folder.write_file(out, onnx.render(trained))
-    elif settings.format == "c":
-        export_folder.write_folder(out, c.render(trained))
+        outputs.write({out: onnx.render(trained)})
+        return
+    if settings.format == "c":
+        made = c.render(trained)
     else:
-        files = webots.render(trained, content, settings.sensors, out.name)
-        export_folder.write_folder(out, files)
+        made = webots.render(trained, content, settings.sensors, out.name)
+    inside = {out / name: each for name, each in made.items()}
+    outputs.check("out", inside, overwrite=settings.overwrite)
+    outputs.write(inside)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Writes a policy as C99 for a microcontroller, with a self-test."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import numpy as np
 
@@ -21,66 +22,9 @@ _ACTIVATIONS = {
     "swish": "0.5f * x[i] * (1.0f + tanhf(0.5f * x[i]))",
 }
 
-_MEMORY_TYPE = """#define POLICY_MEMORY SIZE
-
-/* The memory of a robot. */
-typedef struct {
-    float recalled[POLICY_MEMORY];
-} PolicyMemory;
-
-/* Clears the memory, as at the start of an episode. */
-void policy_begin(PolicyMemory *memory);
-
-"""
-# The gated recurrent unit of `policy.step`, with its gates in the order reset, update, candidate.
-_MEMORY_CODE = """static float logistic(float x)
-{
-    return 0.5f + 0.5f * tanhf(0.5f * x);
-}
-
-static void remember(unsigned learner, const float *features, float *recalled)
-{
-    float seen[3 * POLICY_MEMORY], old[3 * POLICY_MEMORY];
-    layer(SEEN_KERNEL[learner], SEEN_BIAS[learner], FEATURES, 3 * POLICY_MEMORY, features, seen);
-    layer(RECALLED_KERNEL[learner], RECALLED_BIAS[learner], POLICY_MEMORY, 3 * POLICY_MEMORY,
-          recalled, old);
-    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
-        const unsigned update = POLICY_MEMORY + i, candidate = 2 * POLICY_MEMORY + i;
-        const float fresh = tanhf(seen[candidate] + logistic(seen[i] + old[i]) * old[candidate]);
-        recalled[i] = fresh + logistic(seen[update] + old[update]) * (recalled[i] - fresh);
-    }
-}
-
-"""
-# Replaces the neighbours' entries with one layer's sum over neighbours, as in `policy.step`.
-_HEARING_CODE = """static void hear(unsigned learner, float *x)
-{
-    float sum[WIDTH] = {0.0f}, each[WIDTH];
-    for (unsigned k = 0; k < COUNT; k++) {
-        const float *row = x + FIRST + k * ROW;
-        layer(HEARING_KERNEL[learner], HEARING_BIAS[learner], ROW, WIDTH, row, each);
-        activate(each, WIDTH);
-        for (unsigned i = 0; i < WIDTH; i++) {
-            sum[i] += row[0] * each[i];
-        }
-    }
-    for (unsigned i = 0; i < WIDTH; i++) {
-        x[FIRST + i] = sum[i];
-    }
-}
-
-"""
 _SAID_CODE = """    for (unsigned i = 2; i < POLICY_ACTIONS; i++) {
         command[i] = clip(action[i], 1.0f);
     }
-"""
-_BEGIN_CODE = """void policy_begin(PolicyMemory *memory)
-{
-    for (unsigned i = 0; i < POLICY_MEMORY; i++) {
-        memory->recalled[i] = 0.0f;
-    }
-}
-
 """
 _MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
             policy_begin(&memory[i % POLICY_LEARNERS]);
@@ -98,21 +42,21 @@ def render(trained: Policy) -> dict[str, bytes]:
       `policy.c`, `policy.h`, `policy_test.c`, `Makefile` and `README.md`.
     """
     values = _about(trained) | _layout(trained) | _memory(trained)
-    code = values | _code(trained) | _hearing(trained)
-    return {
-        "policy.h": _fill("policy.h", values),
-        "policy.c": _fill("policy.c", code),
-        "policy_test.c": _fill("policy_test.c", values | _cases(trained)),
-        "Makefile": _fill("Makefile", {}),
-        "README.md": _fill("README.md", values | {"observation": export_layout.table(trained)}),
+    files = {
+        "policy.h": values,
+        "policy.c": values | _code(trained) | _hearing(trained),
+        "policy_test.c": values | _cases(trained),
+        "Makefile": {},
+        "README.md": values | {"observation": export_layout.table(trained)},
     }
+    return {name: _fill(name, each).encode() for name, each in files.items()}
 
 
-def _fill(name: str, values: dict[str, str]) -> bytes:
-    return Template((_TEMPLATES / name).read_text()).substitute(values).encode()
+def _fill(name: str, values: Mapping[str, object]) -> str:
+    return Template((_TEMPLATES / name).read_text()).substitute(values)
 
 
-def _about(trained: Policy) -> dict[str, str]:
+def _about(trained: Policy) -> dict[str, Any]:
     """Returns the texts and constants of a policy that fill the templates."""
     robot, task = trained.meta["robot"], trained.meta["task"]
     sizes, learners = _sizes(trained), len(trained.mean)
@@ -128,10 +72,10 @@ def _about(trained: Policy) -> dict[str, str]:
         "control_step": short(task["control_step"]),
         "control_step_f": number(task["control_step"]),
         "target_radius_f": number(task["target_radius"]),
-        "holds": str(int(export_layout.holds(trained))),
-        "observations": str(trained.mean.shape[1]),
-        "actions": str(sizes[-1]),
-        "learners": str(learners),
+        "holds": int(export_layout.holds(trained)),
+        "observations": trained.mean.shape[1],
+        "actions": sizes[-1],
+        "learners": learners,
         **{key: short(robot[key]) for key in ("wheel_radius", "track", "max_wheel_speed")},
         "parameters": f"{parameters:,}",
         "flash": f"{4 * parameters:,}",
@@ -159,23 +103,18 @@ def _widest(trained: Policy) -> int:
     return max([trained.mean.shape[1], *inputs, last + trained.carried])
 
 
-def _hearing(trained: Policy) -> dict[str, str]:
+def _hearing(trained: Policy) -> dict[str, Any]:
     """Returns the code about neighbours; empty for a policy without neighbour messages."""
     said = _SAID_CODE if trained.log_std.shape[1] > 2 else ""
     if trained.hearing is None:
         return {"hearing_code": "", "hearing_call": "", "said": said}
-    code, kernel = _HEARING_CODE, trained.hearing[0]
-    for word, value in (
-        ("WIDTH", kernel.shape[2]),
-        ("COUNT", trained.neighbours["count"]),
-        ("ROW", kernel.shape[1]),
-        ("FIRST", _first(trained)),
-    ):
-        code = code.replace(word, str(value))
+    _, row, width = trained.hearing[0].shape
+    sizes = {"row": row, "width": width, "count": trained.neighbours["count"]}
+    code = _fill("hearing.c", sizes | {"first": _first(trained)})
     return {"hearing_code": code, "hearing_call": "    hear(learner, a);\n", "said": said}
 
 
-def _memory(trained: Policy) -> dict[str, str]:
+def _memory(trained: Policy) -> dict[str, Any]:
     """Returns the texts and code about the memory; empty for a policy without one."""
     size = trained.carried
     if not size:
@@ -185,9 +124,9 @@ def _memory(trained: Policy) -> dict[str, str]:
             "memory_start": "",
         }
     return {
-        "memory_type": _MEMORY_TYPE.replace("SIZE", str(size)),
+        "memory_type": _fill("memory.h", {"size": size}),
         "memory_parameter": "PolicyMemory *memory, ",
-        "memory_code": _MEMORY_CODE.replace("FEATURES", str(_sizes(trained)[-2])) + _BEGIN_CODE,
+        "memory_code": _fill("memory.c", {"features": _sizes(trained)[-2]}),
         "memory_begin": "    PolicyMemory memory[POLICY_LEARNERS];\n",
         "memory_reset": _MEMORY_RESET,
         "memory_argument": "&memory[i % POLICY_LEARNERS], ",
@@ -198,7 +137,7 @@ def _memory(trained: Policy) -> dict[str, str]:
     }
 
 
-def _layout(trained: Policy) -> dict[str, str]:
+def _layout(trained: Policy) -> dict[str, Any]:
     """Makes tables of the observation and the action as lines of a comment."""
     action = trained.meta["action"]
     rows = zip(*(action[key] for key in ("names", "units", "low", "high")), strict=True)
@@ -211,11 +150,11 @@ def _layout(trained: Policy) -> dict[str, str]:
     return {"observation": "\n".join(observed), "action": "\n".join(commanded)}
 
 
-def _code(trained: Policy) -> dict[str, str]:
+def _code(trained: Policy) -> dict[str, Any]:
     """Returns the parts of the code that differ between policies."""
     robot, layout = trained.meta["robot"], trained.meta["observation"]
     return {
-        "widest": str(_widest(trained)),
+        "widest": _widest(trained),
         "offset": _values(layout["offset"]),
         "scale": _values(layout["scale"]),
         "limit": number(layout["limit"]),
@@ -233,20 +172,17 @@ def _arrays(trained: Policy) -> Iterable[str]:
     """Yields the arrays; kernels are transposed so that an output's weights are adjacent."""
     yield _array("MEAN", trained.mean)
     yield _array("STD", trained.std)
-    for i, (kernel, bias) in enumerate(trained.layers):
-        yield _array(f"KERNEL_{i}", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
-        yield _array(f"BIAS_{i}", bias)
+    layers: dict[str, Sequence[np.ndarray]]
+    layers = {f"KERNEL_{i} BIAS_{i}": layer for i, layer in enumerate(trained.layers)}
     if trained.hearing is not None:
-        kernel, bias = trained.hearing
-        yield _array("HEARING_KERNEL", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
-        yield _array("HEARING_BIAS", bias)
+        layers["HEARING_KERNEL HEARING_BIAS"] = trained.hearing
     if trained.memory is not None:
-        for name, part in zip(
-            ("SEEN", "RECALLED"), (trained.memory[:2], trained.memory[2:]), strict=True
-        ):
-            kernel, bias = part
-            yield _array(f"{name}_KERNEL", kernel.swapaxes(1, 2).reshape(len(kernel), -1))
-            yield _array(f"{name}_BIAS", bias)
+        layers["SEEN_KERNEL SEEN_BIAS"] = trained.memory[:2]
+        layers["RECALLED_KERNEL RECALLED_BIAS"] = trained.memory[2:]
+    for names, (kernel, bias) in layers.items():
+        kernel_name, bias_name = names.split()
+        yield _array(kernel_name, kernel.swapaxes(1, 2).reshape(len(kernel), -1))
+        yield _array(bias_name, bias)
     yield _array("DEVIATION", np.exp(trained.log_std))
 
 
@@ -274,7 +210,7 @@ def _calls(sizes: Sequence[int], recalled: int) -> Iterable[str]:
         source, target = target, source
 
 
-def _cases(trained: Policy) -> dict[str, str]:
+def _cases(trained: Policy) -> dict[str, Any]:
     """Makes the self-test's cases, half of them beyond the clip, and NumPy's results for them."""
     draw = np.random.default_rng(0)
     shape = (CASES, *trained.mean.shape)
@@ -291,18 +227,18 @@ def _cases(trained: Policy) -> dict[str, str]:
 
     tables = {"observation": observation, "action": action, "normal": normal, "sample": sample}
     cases = CASES * len(trained.mean)
-    return {"cases": str(cases)} | {name: table(values) for name, values in tables.items()}
+    return {"cases": cases} | {name: table(values) for name, values in tables.items()}
 
 
 def _play(trained: Policy, observation: np.ndarray) -> np.ndarray:
     """Computes the most likely actions for successive observations; clears memory halfway."""
-    found, memory = [], None
+    actions, memory = [], None
     for i, seen in enumerate(observation):
         if i in (0, CASES // 2):
             memory = policy.begin(trained, seen.shape[:-1])
         memory, action = policy.step(trained, memory, seen)
-        found.append(action)
-    return np.stack(found)
+        actions.append(action)
+    return np.stack(actions)
 
 
 def _values(row: Iterable[float]) -> str:

@@ -268,7 +268,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     period = control_period(trained, robot.getBasicTimeStep())
     devices = find_devices(robot, period)
     given, draw = parse(words), np.random.default_rng()
-    stops, parked_at = trained.meta["task"].get("arrival", "latch") == "latch", None
+    stops, parked_at = trained.meta["task"]["arrival"] == "latch", None
     memory, pursued = None, None
     while robot.step(period) != -1:  # the first step gives all sensors a value
         orders = parse([*_custom(robot, given), *words])

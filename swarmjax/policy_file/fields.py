@@ -91,7 +91,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     _check_embodiment(meta)
     _check_arrays(arrays, _Sizes(learners, size, recalled, heard, actions), own=own)
     limit, bounded = float(meta["observation"]["limit"]), meta["activation"] == "tanh"
-    check_reach(arrays, hidden_layers(arrays, own=own), Inputs(limit, heard.robots, bounded))
+    check_reach(arrays, _hidden_layers(arrays, own=own), Inputs(limit, heard.robots, bounded))
 
 
 def _check_memory(meta: Mapping[str, Any]) -> int:
@@ -102,13 +102,7 @@ def _check_memory(meta: Mapping[str, Any]) -> int:
         raise PolicyError("meta.memory and meta.network are both given: expected one of them.")
     _entry(meta, "memory", dict)
     _choice(meta["memory"], "kind", ("gru",), "meta.memory")
-    _entry(meta["memory"], "size", int, "meta.memory")
-    if not 1 <= meta["memory"]["size"] <= _MOST_MEMORY:
-        raise PolicyError(
-            f"meta.memory.size is {short_json(meta['memory']['size'])}: "
-            f"expected 1 to {_MOST_MEMORY}."
-        )
-    return meta["memory"]["size"]
+    return _whole(meta["memory"], "size", 1, _MOST_MEMORY, "meta.memory")
 
 
 class _Heard(NamedTuple):
@@ -149,14 +143,10 @@ def _check_neighbours(meta: Mapping[str, Any]) -> _Heard:
     where = "meta.observation.neighbours"
     _entry(meta["observation"], "neighbours", dict, "meta.observation")
     held = meta["observation"]["neighbours"]
-    for key, least in (("count", 1), ("message_size", 0)):
-        _entry(held, key, int, where)
-        if not least <= held[key] <= _MOST_HEARD:
-            raise PolicyError(
-                f"{where}.{key} is {short_json(held[key])}: expected {least} to {_MOST_HEARD}."
-            )
+    robots = _whole(held, "count", 1, _MOST_HEARD, where)
+    messages = _whole(held, "message_size", 0, _MOST_HEARD, where)
     _check_positive(held, "range", where)
-    return _Heard(held["count"], held["message_size"])
+    return _Heard(robots, messages)
 
 
 # Contents of `meta`
@@ -168,6 +158,15 @@ def _entry(mapping: Mapping[str, Any], key: str, kind: type, where: str = "meta"
     value = mapping[key]
     if not isinstance(value, kind) or isinstance(value, bool):
         raise PolicyError(f"{where}.{key} is {short_json(value)}: expected {_KINDS[kind]}.")
+
+
+def _whole(mapping: Mapping[str, Any], key: str, least: int, most: int, where: str) -> int:
+    _entry(mapping, key, int, where)
+    if not least <= mapping[key] <= most:
+        raise PolicyError(
+            f"{where}.{key} is {short_json(mapping[key])}: expected {least} to {most}."
+        )
+    return mapping[key]
 
 
 def _check_pieces(meta: Mapping[str, Any]) -> None:
@@ -258,10 +257,10 @@ def _check_action(layout: Mapping[str, Any], messages: int) -> int:
     """Checks the layout of the action and returns its size U."""
     every = action_layout(messages)
     for key, expected in zip(("names", "units"), every, strict=True):
-        found = layout.get(key)
-        if not isinstance(found, list | tuple) or tuple(found) != expected:
+        given = layout.get(key)
+        if not isinstance(given, list | tuple) or tuple(given) != expected:
             raise PolicyError(
-                f"meta.action.{key} is {short_json(found)}: expected {short_json(list(expected))}."
+                f"meta.action.{key} is {short_json(given)}: expected {short_json(list(expected))}."
             )
     for key in ("low", "high"):
         _check_numbers(layout, key, len(every[0]), "meta.action")
@@ -317,7 +316,7 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], sizes: _Sizes, *, own: bool)
     `own` tells whether the network is an extension's code.
     """
     learners, size = sizes.learners, sizes.size
-    depth = hidden_layers(arrays, own=own)
+    depth = _hidden_layers(arrays, own=own)
     first = arrays.get(f"actor/{'hidden_0' if depth else 'mean'}/kernel")
     known = own and first is not None and first.ndim == 3
     width = first.shape[1] if known and first is not None else size
@@ -362,18 +361,10 @@ def _network_shapes(arrays: Mapping[str, np.ndarray], learners: int) -> dict[str
     return {name: (learners, *array.shape[1:]) for name, array in own.items()}
 
 
-def hidden_layers(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
-    """Counts the hidden layers; at least one, unless the network is an extension's code.
-
-    Args:
-      arrays: The file's arrays by name.
-      own: Whether the network is an extension's code.
-
-    Returns:
-      The number of layers.
-    """
-    found = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
-    return len(found) if own else max(1, len(found))
+def _hidden_layers(arrays: Mapping[str, np.ndarray], *, own: bool) -> int:
+    """Counts the hidden layers; at least one, unless the network is an extension's code."""
+    layers = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
+    return len(layers) if own else max(1, len(layers))
 
 
 def _shapes(

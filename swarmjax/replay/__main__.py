@@ -19,7 +19,6 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate import witness
 from swarmjax.evaluate.trials import Entrant
-from swarmjax.export import folder as export_folder
 from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
@@ -42,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     with progress:
         episodes = replay(settings, entrants, progress)
         page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
-        export_folder.write_file(out, page.encode())
+        outputs.write({out: page.encode()})
         if video:
             bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
             report = partial(progress.advance, bar)

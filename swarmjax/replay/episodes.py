@@ -52,7 +52,7 @@ def replay(
     if settings.worst is not None:
         bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
         report = partial(progress.advance, bar)
-        trials = evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report)
+        trials = list(evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report))
         picks = worst(trials, settings.worst)
     used = [chosen[row] for row in {pick.cell for pick in picks}]
     limits = [evaluate_trials.specialise(settings.evaluation, cell).step_limit for cell in used]

@@ -9,7 +9,7 @@ import numpy as np
 from swarmjax import extension
 from swarmjax.config import show
 from swarmjax.config.section import build_stored
-from swarmjax.evaluate import engine_c
+from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.extension import RewardTerm
 from swarmjax.policy import Policy, PolicyError
@@ -189,7 +189,7 @@ def record(
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
     over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
-    driver = engine_c.by_policy(judge)
+    driver = engine_c.ByPolicy(judge)
     memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():
         memory, action = driver.act(memory, arenas)
@@ -240,7 +240,7 @@ def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
         pose=arenas.pose,
         ray=sight.ray,
         distance=sight.distance,
-        touching=engine_c.touching(judge, arenas.data),
+        touching=contacts.touching(judge, arenas.data),
         arrived=arenas.outcome.arrived,
         contacts=arenas.outcome.contacts,
         action=action,

@@ -18,7 +18,7 @@ from steering import AHEAD, SPEED, SPIN, STAY, STEER, STEP, STRIDE
 
 from swarmjax import policy
 from swarmjax.config import ConfigError
-from swarmjax.evaluate import engine_c
+from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate import rays as evaluate_rays
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
@@ -101,7 +101,7 @@ def test_a_step_needs_the_action_of_a_policy_that_remembers(tmp_path: Path) -> N
     trained = policies.saved(tmp_path / "recalls.npz", given, **said)
     judge = dataclasses.replace(_judge(tmp_path, _stage()), policy=trained)
     arenas = _start(judge, [[-0.1, 0.2, 0.0]])
-    with pytest.raises(PolicyError, match=r"^the policy has a memory: pass the action that `by_p"):
+    with pytest.raises(PolicyError, match=r"^the policy has a memory: pass the action that `ByPo"):
         engine_c.step(judge, arenas)
 
 
@@ -237,7 +237,7 @@ def test_touching_is_a_gap_below_zero(tmp_path: Path) -> None:
         ]
     )
     assert np.abs(gap).min() > 1e-7  # float32 quaternions move the walls by 1e-8 m
-    touching = engine_c.touching(judge, data)
+    touching = contacts.touching(judge, data)
     assert touching.mean(axis=(0, 1)).min() > 0.1  # every kind occurs
     np.testing.assert_array_equal(touching, gap <= 0.0)
 
@@ -252,7 +252,7 @@ def test_the_walls_stand_where_the_level_says(tmp_path: Path) -> None:
         wall = [np.array([[0.5 * side - 0.037 - gap, 0.0, 0.0]], np.float32) for side in sides]
         levels = [level._replace(start=x) for level, x in zip(drawn, wall, strict=True)]
         arenas = engine_c.start(judge, levels)
-        touched = engine_c.touching(judge, arenas.data)
+        touched = contacts.touching(judge, arenas.data)
         assert (touched.any(axis=(1, 2)) == (gap < 0)).all()
         if gap > 0:
             nearest = arenas.observation[:, 0, INFRARED].min(axis=-1)
@@ -733,7 +733,7 @@ def test_impulses_are_of_normal_forces(tmp_path: Path, body: BodyName) -> None:
     data = _run(judge, _start(judge, CROWD, obstacle=BOX), 3).data[0]
     mujoco.mj_step2(judge.model, data)
     rubs, force = 0.0, np.zeros(6)
-    found = engine_c._push(judge.model, data)
+    found = contacts.push(judge.model, data)
     solved = np.flatnonzero(data.contact.efc_address >= 0)
     assert len(solved) == len(found.force) > 0
     for push, i in zip(found.force, solved, strict=True):
@@ -826,7 +826,7 @@ def test_rays_and_contacts_are_those_of_the_shape(tmp_path: Path, shape: Any) ->
     expected = infrared.distances(pose, side, box, 0.037, 0.04, np)
     gap = np.stack([gaps.gaps(*each, 0.037, np) for each in zip(pose, side, box, strict=True)])
     assert np.abs(gap).min() > 1e-6
-    touching = engine_c.touching(judge, arenas.data)
+    touching = contacts.touching(judge, arenas.data)
     np.testing.assert_array_equal(touching, gap <= 0.0)
     # A robot sinks at most 4 mm into things. Deeper inside, a ray's origin may be inside a thing,
     # and the ray does not tell which thing that is.

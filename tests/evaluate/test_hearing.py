@@ -11,6 +11,7 @@ import policies
 import pytest
 from sentences import refusal
 
+from benchmarks import learners_judge
 from swarmjax import policy_file
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_c, engine_mjx, rays
@@ -75,7 +76,7 @@ def test_both_engines_observe_the_same_neighbours_step_by_step(kind: str, tmp_pa
     level = evaluate_judge.draw_level(judge.stage, judge.spacing, 1, 3)
     arenas = engine_c.start(judge, [level])
     assert world.spacing.robots >= STAGE.robots
-    level = engine_mjx._make_room(level, world.spacing)
+    level = learners_judge._make_room(level, world.spacing)
     state = jax.jit(partial(env.reset, world))(jax.tree.map(jnp.asarray, level))
     state = state.replace(sim=physics.unpack(world.physics, state.sim))
     step = jax.jit(partial(env.step, world))

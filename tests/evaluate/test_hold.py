@@ -57,7 +57,7 @@ def _by_mjx(path: Path, actions: np.ndarray) -> Outcome:
         row = jnp.minimum(arenas.clock, len(actions) - 1)
         return memory, jnp.asarray(actions)[row]
 
-    run = jax.jit(partial(engine_mjx._run, world, act, steps=len(actions) + 5))
+    run = jax.jit(partial(engine_mjx.run, world, act, steps=len(actions) + 5))
     arenas, counts, broken = run(levels, memory=None)
     assert not np.asarray(broken).any()
     return Outcome(**jax.tree.map(np.asarray, engine_mjx._outcome(arenas, counts)))

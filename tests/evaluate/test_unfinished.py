@@ -94,13 +94,13 @@ def test_the_same_command_goes_on_after_a_stop(
             "swarmjax.evaluate: interrupted, 1 cell is in stopped/unfinished, and the same command "
             "continues with the rest.\n"
         )
-    judged, run_each = [], evaluate_trials.run_each
+    judged, run = [], evaluate_trials.run
 
     def spy(config: EvaluateConfig, chosen: Any, *rest: Any) -> Iterator[Any]:
         judged.extend(cell.name for cell in chosen)
-        return run_each(config, chosen, *rest)
+        return run(config, chosen, *rest)
 
-    monkeypatch.setattr(evaluate_trials, "run_each", spy)
+    monkeypatch.setattr(evaluate_trials, "run", spy)
     assert _command(monkeypatch, *words, "out=stopped") == 0
     assert judged == ["two"]
     assert "1 of 2 cells were judged before" in capsys.readouterr().out

@@ -13,9 +13,8 @@ import policies
 import pytest
 from policies import Arrays, saved, several
 
-from swarmjax import policy
+from swarmjax import outputs, policy
 from swarmjax.export import c as export_c
-from swarmjax.export import folder as export_folder
 from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
@@ -65,7 +64,7 @@ def _by_onnx(trained: Policy, seen: np.ndarray) -> np.ndarray:
 
 
 def _by_c(trained: Policy, seen: np.ndarray, folder: Path) -> np.ndarray:
-    export_folder.write_folder(folder, export_c.render(trained))
+    outputs.write({folder / name: each for name, each in export_c.render(trained).items()})
     flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
     built = [*("gcc", *flags, "policy.c", "-lm", "-o", "policy.so")]
     subprocess.run(built, cwd=folder, check=True)
@@ -155,7 +154,7 @@ def _by_onnx_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray) -> np.
 
 
 def _by_c_steps(trained: Policy, seen: np.ndarray, begins: np.ndarray, folder: Path) -> np.ndarray:
-    export_folder.write_folder(folder, export_c.render(trained))
+    outputs.write({folder / name: each for name, each in export_c.render(trained).items()})
     flags = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")
     subprocess.run(["gcc", *flags, "policy.c", "-lm", "-o", "policy.so"], cwd=folder, check=True)
     library, into = ctypes.CDLL(str(folder / "policy.so")), ctypes.c_void_p

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import re
 import sys
 from pathlib import Path
 
@@ -13,11 +12,10 @@ import pytest
 from policies import saved, saved_for_webots
 from sentences import refusal
 
-from swarmjax import command, policy_file
-from swarmjax.config import ConfigError, build, to_dict
+from swarmjax import command, outputs, policy_file
+from swarmjax.config import build, to_dict
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
-from swarmjax.export import folder as export_folder
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import directory
 from swarmjax.run.load_settings import load_train, read_config
@@ -144,7 +142,7 @@ def test_export_refuses(
         (given, "out=copy.npy"): "out is copy.npy, but format is npz: end it in .npz.",
         (given, "format=onnx", "out=a"): "out is a, but format is onnx: end it in .onnx.",
         (given, "format=webots", "out=a b"): "out is a b, whose name is also the controller's: ",
-        (given, "format=c", f"out={tmp_path / 'file'}"): "file, a file: give a folder.",
+        (given, "format=c", f"out={tmp_path / 'file'}"): "which cannot be written: ",
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
         (given, "format=c", "out=."): "out is ., which does not end with a name: add the name of ",
@@ -204,74 +202,40 @@ def test_a_step_is_named_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
 # Folders
 
 
-def test_a_folder_is_replaced_only_as_it_was_exported(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    export_folder.write_folder(out, {"a": b"1", "b": b"2"})
+def test_a_folder_is_replaced_only_as_it_was_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved(tmp_path / "policy.npz")
+    words, out = (f"policy={tmp_path / 'policy.npz'}", "format=c"), tmp_path / "policy_c"
+    assert export.main(words) == 0
+    first = _digests(out)
     (out / "build").mkdir()
-    (out / "build" / "a.o").write_bytes(b"made of a")
-    export_folder.write_folder(out, {"a": b"3"})
-    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "export.json"} \
-        == {"a": b"3"}  # fmt: skip
-    assert json.loads((out / "export.json").read_text()) == {"a": hashlib.sha256(b"3").hexdigest()}
-    (out / "a").write_bytes(b"changed by hand")
-    with pytest.raises(ConfigError, match=r"out, where a is not from an export or was "):
-        export_folder.write_folder(out, {"a": b"4"})
-    assert (out / "a").read_bytes() == b"changed by hand"
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [("thesis.tex", b"words"), ("export.json", b"[]"), ("export.json", b"{"), ("a", b"1")],
-)
-def test_a_folder_of_somebody_elses_is_left_alone(
-    name: str, content: bytes, tmp_path: Path
-) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ConfigError, match=rf", where {re.escape(name)} is not from an export"):
-        export_folder.write_folder(tmp_path, {"a": b"1"})
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {name: content}
-
-
-def test_a_link_in_an_export_is_not_followed(tmp_path: Path) -> None:
-    out, precious = tmp_path / "out", tmp_path / "precious"
-    export_folder.write_folder(out, {"a": b"1"})
-    precious.write_bytes(b"1")
-    (out / "a").unlink()
-    (out / "a").symlink_to(precious)
-    with pytest.raises(ConfigError, match=r", where a is not from an export or was"):
-        export_folder.write_folder(out, {"a": b"2"})
-
-
-def test_a_folder_whose_writing_breaks_off_is_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    export_folder.write_folder(out, {"a": b"1"})
-    before, rename = _digests(tmp_path), Path.rename
-
-    def crash(self: Path, target: Path) -> Path:
-        if self.name.endswith(".new"):
-            raise KeyboardInterrupt
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "rename", crash)
-    with pytest.raises(KeyboardInterrupt):
-        export_folder.write_folder(out, {"a": b"2"})
-    assert _digests(tmp_path) == before
+    (out / "build" / "a.o").write_bytes(b"made of it")
+    (out / "thesis.tex").write_bytes(b"mine")
+    saved(tmp_path / "policy.npz", policies.arrays(seed=1))
+    assert export.main(words) == 0
+    second = _digests(out)
+    assert first["policy.c"] != second["policy.c"]
+    assert {"build/a.o", "thesis.tex"} < second.keys()
+    (out / "Makefile").write_bytes(b"changed by hand")
+    said = _refusal(monkeypatch, capsys, *words)
+    assert "Makefile, which swarmjax did not write or which was changed since: give" in said
+    assert (out / "Makefile").read_bytes() == b"changed by hand"
+    assert export.main([*words, "overwrite=true"]) == 0
+    assert _digests(out) == second
 
 
 def test_a_file_whose_writing_breaks_off_is_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    export_folder.write_file(tmp_path / "a", b"1")
+    outputs.write({tmp_path / "a": b"1"})
 
     def crash(_: int) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("os.fsync", crash)
     with pytest.raises(KeyboardInterrupt):
-        export_folder.write_file(tmp_path / "a", b"2")
+        outputs.write({tmp_path / "a": b"2"})
     assert {name: (tmp_path / name).read_bytes() for name in directory.visible(tmp_path)} == {
         "a": b"1"
     }

@@ -149,9 +149,7 @@ def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
     return jnp.stack([draw, *row], axis=-1)
 
 
-def _live(
-    ppo: PPO, deaf: bool, state: LearnerState, carry: Any, key: jax.Array
-) -> tuple[Any, Any]:
+def _live(ppo: PPO, deaf: bool, state: LearnerState, carry: Any, key: jax.Array) -> tuple[Any, Any]:
     """Runs one control step of all pairs; the numbers stay fixed in an episode of STEPS steps."""
     draw, said, clock = carry
     noise, fresh = jax.random.split(key)

@@ -50,7 +50,7 @@ class _Driver:
 
 
 def _drive(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(engine_c, "by_policy", lambda judge: _Driver())
+    patch.setattr(engine_c, "ByPolicy", lambda judge: _Driver())
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -10,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax import policy, policy_file
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import losses, networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
-from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import observation
 from swarmjax.task.env import World
@@ -146,18 +143,3 @@ def test_a_rollout_sees_what_was_seen_before_and_forgets_where_an_episode_begins
         # Each step moves the history by one place, and a new episode begins with a history of 0.
         np.testing.assert_array_equal(looks[age][1:], np.where(over, 0.0, looks[age - 1][:-1]))
     assert (np.abs(looks[2][-1]).max(axis=(1, 2)) > 0.0).sum() == 8 - over[-2:].any(axis=0).sum()
-
-
-def test_the_file_of_a_policy_with_a_history_keeps_it_by_itself(
-    stacked: Seen, tmp_path: Path
-) -> None:
-    """Gives the file's policy one observation after the other, as in deployment."""
-    leaves = {name: leaf[None] for name, leaf in to_leaves(stacked.state).items()}
-    write_policy(tmp_path / "policy.npz", leaves, stacked.config, update=0, seed=0)
-    trained = policy_file.read(tmp_path / "policy.npz")
-    memory = policy.begin(trained, stacked.observation.shape[1:3])
-    for step, expected in enumerate(stacked.action):
-        memory, action = policy.step(trained, memory, stacked.observation[step, ..., :10])
-        np.testing.assert_allclose(action, expected, atol=2e-6)  # float32, sums of thirty terms
-        assert memory is not None
-        memory = np.where(stacked.over[step][:, None, None], 0.0, memory)
