@@ -126,7 +126,7 @@ class History:
 
 
 def read(run: Path) -> History:
-    """Reads a run
+    """Reads a run directory.
 
     Raises:
       ConfigError: if a file is missing or damaged, or a seed has no row.
@@ -291,7 +291,7 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
     """Reads a file with one JSON object per line; skips a last line without a newline.
 
     Args:
-      run: the run
+      run: the run directory.
       name: name of the file.
 
     Yields:
