@@ -25,12 +25,7 @@ from swarmjax.run.settings import TrainConfig
 Row = dict[str, Any]
 
 # Each stage's newest verdict, in the order of the stages.
-BY_STAGE = (
-    "success_by_stage",
-    "complete_by_stage",
-    "contacts_by_stage",
-    "return_by_stage",
-)
+BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
 _LISTS = ("mix", "weights", *BY_STAGE)
 # What the curriculum over levels did on each stage, if there is one.
 LEVELS = (

@@ -51,8 +51,6 @@ class ReproduceConfig(Section):
         if not self.arms:
             raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
         for arm in self.arms:
-            if self.arms.count(arm) > 1:
-                raise ConfigError(f"arms names {arm} more than once: give each once.")
             first = arm.removesuffix("_expanded")
             if first not in self.arms:
                 raise ConfigError(f"arms names {arm}, but not {first}, which it continues.")

@@ -21,7 +21,7 @@ from swarmjax.evaluate.curves import curve
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
-from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
+from swarmjax.reproduce.measures import AXES, FINAL, SHARE, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
 SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
@@ -140,20 +140,14 @@ def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) ->
 
 def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
     """Draws the results of the final policies on both stages: every seed, and intervals."""
-    kinds = {
-        "targets_reached": "targets reached",
-        "all_reached": "episodes in which all arrived",
-        "sensed_share": "robot steps within infrared range",
-        "contacts_per_robot": "contacts per robot and episode",
-    }
     figure = Figure(figsize=(drawing.WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
     places = figure.subplots(2, 2, sharey=True)
-    for place, (key, label) in zip(places.flat, kinds.items(), strict=True):
+    for place, (key, (label, unit)) in zip(places.flat, FINAL.items(), strict=False):
         for shift, stage, mark in ((-0.16, LAST, "o"), (0.16, EXPANDED, "s")):
             for row, arm in enumerate(arms):
                 _dots(place, data.judged[arm, stage][key], row + shift, (COLOURS[arm], mark))
         drawing.dress(place, label, 9)
-        if key != "contacts_per_robot":
+        if unit is SHARE:
             place.xaxis.set_major_formatter(drawing.percent())
         place.set_xlim(left=max(0.0, place.get_xlim()[0]))
     places[0, 0].set_yticks(range(len(arms)), arms)
