@@ -94,7 +94,7 @@ def _write(path: Path, found: Evaluation, limit: float) -> None:
         if "policies" in found.result:
             from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
-            for name, content in figures.draw(found.result, found.trials, limit).items():
+            for name, content in figures.png_files(found.result, found.trials, limit).items():
                 (path / f"{name}.png").write_bytes(content)
     except OSError as error:
         raise outputs.unwritable("out", path, error) from None

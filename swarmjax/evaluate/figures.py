@@ -16,7 +16,7 @@ _MARK, _WORST = "#0b4f9e", "#c04000"
 _ROW = 0.32  # inches per cell
 
 
-def draw(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> dict[str, bytes]:
+def png_files(result: Mapping[str, Any], trials: Sequence[Trial], limit: float) -> dict[str, bytes]:
     """Draws the plots of an evaluation.
 
     Args:

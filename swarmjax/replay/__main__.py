@@ -70,8 +70,8 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
     """Names the reward terms of training whose code is missing here."""
     earning = record.weights(entrant.policy, settings.task)
     own = record.own_terms(entrant.policy, settings.extensions, earning)
-    found = {piece.name for piece, _ in own}
-    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in found)
+    known = {piece.name for piece, _ in own}
+    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in known)
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:

@@ -67,11 +67,11 @@ def _cells(settings: ReplayConfig) -> list[Cell]:
     suite = cells.load(settings.evaluation)
     if settings.cell is None:
         return list(suite.cells)
-    found = [cell for cell in suite.cells if cell.name == settings.cell]
-    if not found:
+    named = [cell for cell in suite.cells if cell.name == settings.cell]
+    if not named:
         names = ", ".join(cell.name for cell in suite.cells)
         raise ConfigError(f"cell is {show(settings.cell)}: give one of {names}.")
-    return found
+    return named
 
 
 def _check_worst(settings: ReplayConfig, count: int) -> None:
@@ -129,7 +129,7 @@ def _record(
     report: Callable[[int], None],
 ) -> list[ReplayEpisode]:
     """Records episodes; those of one cell run side by side."""
-    found = {}
+    recorded = {}
     for i in sorted({pick.cell for pick in picks}):
         cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]
         levels = cells.split(cell.levels)
@@ -141,5 +141,5 @@ def _record(
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
             number = int(cell.episodes[pick.row])
             label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
-            found[pick] = ReplayEpisode(label, number, list(by_policy))
-    return [found[pick] for pick in picks]
+            recorded[pick] = ReplayEpisode(label, number, list(by_policy))
+    return [recorded[pick] for pick in picks]

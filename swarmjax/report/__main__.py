@@ -50,7 +50,7 @@ def write(
     from swarmjax.report import figures as report_figures
     from swarmjax.report import levels as report_levels
 
-    figures = report_figures.draw(history)
+    figures = report_figures.png_files(history)
     best = report_levels.read(run, history.config)
     pictures = None if best is None else report_levels.draw(best, history.config)
     if pictures is not None:

@@ -33,7 +33,7 @@ _CURVES = {
 }
 
 
-def draw(history: History) -> dict[str, bytes]:
+def png_files(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
@@ -133,14 +133,14 @@ def levels(history: History) -> Figure | None:
     """
     if history.levels is None:
         return None
-    found = history.levels
-    ended = sum(found[f"levels_{kind}"] for kind in ("fresh", "replayed", "mutated"))
-    again = found["levels_replayed"] + found["levels_mutated"]
+    by_level = history.levels
+    ended = sum(by_level[f"levels_{kind}"] for kind in ("fresh", "replayed", "mutated"))
+    again = by_level["levels_replayed"] + by_level["levels_mutated"]
     measures = {
-        "levels kept": found["levels_held"],
+        "levels kept": by_level["levels_held"],
         "episodes that began on them or a mutated one": _shares(again, np.asarray(ended)),
-        "success on the levels kept": found["levels_success"],
-        "mean score of the levels kept": found["levels_score"],
+        "success on the levels kept": by_level["levels_success"],
+        "mean score of the levels kept": by_level["levels_score"],
     }
     figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True).ravel()

@@ -81,7 +81,7 @@ class Claim(NamedTuple):
 
 
 class ClaimVerdict(NamedTuple):
-    """The verdict on a claim: the outcome, why it is open if it is, and what the readings found."""
+    """The verdict on a claim: the outcome, why it is open if it is, and the readings' findings."""
 
     claim: Claim
     outcome: Literal["reproduced", "not reproduced", "undecidable"]

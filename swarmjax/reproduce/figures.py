@@ -64,7 +64,7 @@ class Panel(NamedTuple):
         return f"{_LABELS[self.of]},\n{which}"
 
 
-def draw(data: Reproduction) -> dict[str, bytes]:
+def png_files(data: Reproduction) -> dict[str, bytes]:
     """Draws every figure with at least one finished arm.
 
     Returns:

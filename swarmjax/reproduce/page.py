@@ -38,7 +38,7 @@ def write(out: Path) -> Path:
     # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.reproduce import figures as reproduce_figures
 
-    figures = reproduce_figures.draw(data)
+    figures = reproduce_figures.png_files(data)
     lacks = {name: data.lacking(plot.arms) for name, plot in reproduce_figures.PLOTS.items()}
     content = {f"{FIGURES}/{name}.png": png for name, png in figures.items()}
     content[PAGE] = _page(data, figures, lacks).encode()
