@@ -5,7 +5,6 @@ in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown 
 same levels. No JAX.
 """
 
-import shlex
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -38,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
         replay_video.check()
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
-    words = shlex.join(["python", "-m", "swarmjax.replay", *arguments])
+    words = command.line("replay", *arguments)
     with progress:
         episodes = replay(settings, entrants, progress)
         page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)

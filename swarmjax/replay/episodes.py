@@ -44,14 +44,15 @@ def replay(
       ConfigError: If there is no such level, or the physics breaks down.
     """
     chosen = _cells(settings)
-    _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
+    count = sum(len(cell.episodes) for cell in chosen)
+    _check_worst(settings, count)
     for cell in chosen:
         for each in entrants:
             evaluate_judge.check_policy(settings.evaluation, cell.stage, *each)
-    picks = _named(settings, chosen)
-    if settings.worst is not None:
-        bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
-        report = partial(progress.advance, bar)
+    if settings.worst is None:
+        picks = _named(settings, chosen)
+    else:
+        report = partial(progress.advance, progress.add_task("episodes", total=count))
         trials = evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report)
         picks = worst(trials, settings.worst)
     used = [chosen[row] for row in {pick.cell for pick in picks}]
@@ -85,8 +86,6 @@ def _check_worst(settings: ReplayConfig, count: int) -> None:
 
 def _named(settings: ReplayConfig, chosen: Sequence[Cell]) -> list[Pick]:
     """Finds the named levels; they need a single cell."""
-    if settings.worst is not None:
-        return []
     if len(chosen) > 1:
         names = ", ".join(cell.name for cell in chosen)
         raise ConfigError(

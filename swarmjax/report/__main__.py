@@ -8,7 +8,6 @@ For several runs it prints a table: see `table`. With `out` it also writes the t
 """
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,7 +80,7 @@ def _write_table(lines: Sequence[TableLine], made_by: str, settings: ReportConfi
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(ReportConfig, arguments)
-    made_by = shlex.join(["python", "-m", "swarmjax.report", *arguments])
+    made_by = command.line("report", *arguments)
     if settings.runs is not None:
         lines = table.read(table.find(settings.runs))
         sys.stdout.write(f"{table.text(lines)}\n")
