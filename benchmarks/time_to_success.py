@@ -98,8 +98,8 @@ def _read_rows(run: Path, stages: int) -> list[Row]:
     for where, row in report_rows.read_lines(run, METRICS):
         report_rows.check(row, ("seed", "arena_steps", "broken_arenas"), report_rows.WHOLE, where)
         report_rows.check(row, ("train_s",), report_rows.NUMBER_OR_NULL, where)
-        success = row.get("success_by_stage")
-        report_rows.per_stage(success, stages, f"{where} has success_by_stage")
+        by_stage = report_rows.list_of(report_rows.NUMBER_OR_NULL, stages)
+        report_rows.check(row, ("success_by_stage",), by_stage, where)
         found.append(row)
     return found
 

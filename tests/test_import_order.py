@@ -19,7 +19,7 @@ ROOMS = {
     "curriculum": {"config", "extension", "shards", "task"},
     "training": SHARED | {"sim", "task", "ppo", "curriculum", "shards"},
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
-    "evaluate": SHARED | {"sim", "task"},
+    "evaluate": SHARED | {"sim", "task", "pages"},
     "export": SHARED | {"sim", "run", "evaluate"},
     "pages": {"config", "outputs"},
     "policy_file": {"config", "policy", "policy_network", "extension", "outputs"},

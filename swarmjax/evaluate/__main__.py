@@ -91,7 +91,7 @@ def _content(out: Path, found: Evaluation, limit: float) -> dict[Path, bytes]:
     if "policies" in found.result:
         from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
-        drawn = figures.draw(found.result, found.trials, limit)
+        drawn = figures.png_files(found.result, found.trials, limit)
         files |= {f"{name}.png": content for name, content in drawn.items()}
     return {out / name: content for name, content in files.items()}
 

@@ -5,7 +5,6 @@ in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown 
 same levels. No JAX.
 """
 
-import shlex
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -37,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         replay_video.check()
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
-    words = shlex.join(["python", "-m", "swarmjax.replay", *arguments])
+    words = command.line("replay", *arguments)
     with progress:
         episodes = replay(settings, entrants, progress)
         page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
@@ -69,8 +68,8 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
     """Names the reward terms of training whose code is missing here."""
     earning = record.weights(entrant.policy, settings.task)
     own = record.own_terms(entrant.policy, settings.extensions, earning)
-    found = {piece.name for piece, _ in own}
-    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in found)
+    known = {piece.name for piece, _ in own}
+    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in known)
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:

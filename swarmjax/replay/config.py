@@ -23,14 +23,12 @@ class ReplayConfig(JudgeConfig):
         metadata=about("numbers of the levels, as in 0,7,12; null: 0, unless worst is given"),
     )
     worst: int | None = field(
-        default=None,
-        metadata=about("replay this many of the worst episodes", 1, 100),
+        default=None, metadata=about("replay this many of the worst episodes", 1, 100)
     )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
     video_speed: float = field(
-        default=1.0,
-        metadata=about("seconds of the episode per second of video", 0.05, 100.0),
+        default=1.0, metadata=about("seconds of the episode per second of video", 0.05, 100.0)
     )
 
     def _check(self) -> None:

@@ -44,14 +44,15 @@ def replay(
       ConfigError: If there is no such level, or the physics breaks down.
     """
     chosen = _cells(settings)
-    _check_worst(settings, sum(len(cell.episodes) for cell in chosen))
+    count = sum(len(cell.episodes) for cell in chosen)
+    _check_worst(settings, count)
     for cell in chosen:
         for each in entrants:
             evaluate_judge.check_policy(settings.evaluation, cell.stage, *each)
-    picks = _named(settings, chosen)
-    if settings.worst is not None:
-        bar = progress.add_task("episodes", total=sum(len(cell.episodes) for cell in chosen))
-        report = partial(progress.advance, bar)
+    if settings.worst is None:
+        picks = _named(settings, chosen)
+    else:
+        report = partial(progress.advance, progress.add_task("episodes", total=count))
         trials = list(evaluate_trials.run(settings.evaluation, chosen, entrants[:1], report))
         picks = worst(trials, settings.worst)
     used = [chosen[row] for row in {pick.cell for pick in picks}]
@@ -67,11 +68,11 @@ def _cells(settings: ReplayConfig) -> list[Cell]:
     suite = cells.load(settings.evaluation)
     if settings.cell is None:
         return list(suite.cells)
-    found = [cell for cell in suite.cells if cell.name == settings.cell]
-    if not found:
+    named = [cell for cell in suite.cells if cell.name == settings.cell]
+    if not named:
         names = ", ".join(cell.name for cell in suite.cells)
         raise ConfigError(f"cell is {show(settings.cell)}: give one of {names}.")
-    return found
+    return named
 
 
 def _check_worst(settings: ReplayConfig, count: int) -> None:
@@ -85,8 +86,6 @@ def _check_worst(settings: ReplayConfig, count: int) -> None:
 
 def _named(settings: ReplayConfig, chosen: Sequence[Cell]) -> list[Pick]:
     """Finds the named levels; they need a single cell."""
-    if settings.worst is not None:
-        return []
     if len(chosen) > 1:
         names = ", ".join(cell.name for cell in chosen)
         raise ConfigError(
@@ -129,7 +128,7 @@ def _record(
     report: Callable[[int], None],
 ) -> list[ReplayEpisode]:
     """Records episodes; those of one cell run side by side."""
-    found = {}
+    recorded = {}
     for i in sorted({pick.cell for pick in picks}):
         cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]
         levels = cells.split(cell.levels)
@@ -141,5 +140,5 @@ def _record(
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
             number = int(cell.episodes[pick.row])
             label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
-            found[pick] = ReplayEpisode(label, number, list(by_policy))
-    return [found[pick] for pick in picks]
+            recorded[pick] = ReplayEpisode(label, number, list(by_policy))
+    return [recorded[pick] for pick in picks]

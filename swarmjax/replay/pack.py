@@ -99,11 +99,11 @@ def colours(robots: int) -> list[str]:
     """
     if robots <= len(_PALETTE):
         return list(_PALETTE[:robots])
-    found = [
+    rgb = [
         colorsys.hls_to_rgb(i * _GOLDEN % 1.0, (0.5, 0.62, 0.42)[i % 3], 0.62)
         for i in range(robots)
     ]
-    return [f"#{''.join(f'{round(255 * part):02x}' for part in each)}" for each in found]
+    return [f"#{''.join(f'{round(255 * part):02x}' for part in each)}" for each in rgb]
 
 
 def dark(reach: float) -> int:

@@ -11,6 +11,7 @@ from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import ReplayEpisode
 from swarmjax.sim import gaps
 
+_SOFTWARE = ("swarmjax", "mujoco", "numpy")  # what computed the episodes
 _SCRIPTS = ("replay/replay_data.js", "replay/replay_draw.js", "replay/replay.js")
 
 
@@ -88,6 +89,7 @@ def _about(settings: ReplayConfig) -> str:
 def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
     """States how the episodes were made and how precisely they are shown, one fact per line."""
     names = zip(settings.policies, policies, strict=True)
+    versions = provenance.versions()
     length, angle = 1e3 * pack.LENGTH, pack.ANGLE
     earned = "; nothing after arrival" if settings.task.arrival == "latch" else ""
     return [
@@ -101,7 +103,7 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
             f"{500 * pack.RAY:g} mm for rays and {pack.REWARD / 2:g} for the sum of each reward "
             "term",
         ),
-        ("versions", ", ".join(f"{name} {found}" for name, found in _versions().items())),
+        ("versions", ", ".join(f"{name} {versions[name]}" for name in _SOFTWARE)),
         ("made by", words),
     ]
 
@@ -123,8 +125,3 @@ def _choice(settings: ReplayConfig) -> str:
         f"the {settings.worst} worst levels of {settings.policies[0]} among {count} {origin}, "
         "worst first: fewest targets reached, then most contacts, then longest"
     )
-
-
-def _versions() -> dict[str, str]:
-    """Returns the versions of the software that computed the episodes."""
-    return {k: v for k, v in provenance.versions().items() if k in ("swarmjax", "mujoco", "numpy")}

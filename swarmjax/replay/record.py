@@ -138,7 +138,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
       [..., R] by name: each term times its weight. Terms with weight 0 are left out.
     """
     under_way = np.ones(steps.distance.shape) if steps.outside is None else steps.outside
-    found = {
+    unweighted = {
         "progress": steps.distance_before - steps.distance,
         "proximity": under_way * (steps.infrared < steps.sensor_range).any(axis=-1),
         "arrival": steps.arrives,
@@ -147,7 +147,7 @@ def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
         "touching": steps.touching.any(axis=-1),
         "step_penalty": under_way,
     }
-    weighted = {name: getattr(weights, name) * term for name, term in found.items()}
+    weighted = {name: getattr(weights, name) * term for name, term in unweighted.items()}
     return {name: term for name, term in weighted.items() if getattr(weights, name)}
 
 

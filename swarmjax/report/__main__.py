@@ -8,7 +8,6 @@ For several runs it prints a table: see `table`. With `out` it also writes the t
 """
 
 import json
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,7 +47,7 @@ def write(
     # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.report import figures as report_figures
 
-    figures = report_figures.draw(history)
+    figures = report_figures.png_files(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     written = builder.write(out, content, overwrite=overwrite)
@@ -75,7 +74,7 @@ def _write_table(lines: Sequence[TableLine], made_by: str, settings: ReportConfi
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(ReportConfig, arguments)
-    made_by = shlex.join(["python", "-m", "swarmjax.report", *arguments])
+    made_by = command.line("report", *arguments)
     if settings.runs is not None:
         lines = table.read(table.find(settings.runs))
         sys.stdout.write(f"{table.text(lines)}\n")

@@ -33,7 +33,7 @@ _CURVES = {
 }
 
 
-def draw(history: History) -> dict[str, bytes]:
+def png_files(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:

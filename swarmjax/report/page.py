@@ -10,6 +10,7 @@ from swarmjax.config import to_dict
 from swarmjax.pages import builder
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History, Row
+from swarmjax.run.load_settings import leaves
 
 GOOD = 0.9  # success at which a stage counts as learned
 STYLES = (builder.STYLE, "report/report.css")
@@ -50,9 +51,7 @@ def facts(history: History) -> list[tuple[str, str]]:
       The heading and the text of each line.
     """
     trained, names = history.config, history.names
-    stages_by = to_dict(trained.curriculum)
-    levels_by = stages_by.pop("levels")
-    options = [*stages_by.items(), *((f"levels.{key}", value) for key, value in levels_by.items())]
+    options = leaves(to_dict(trained.curriculum))
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"
@@ -61,7 +60,7 @@ def facts(history: History) -> list[tuple[str, str]]:
         ("stages", stages),
         (
             "curriculum",
-            ", ".join(f"{key}={value}" for key, value in options if value is not None),
+            ", ".join(f"{key}={value}" for key, value in options.items() if value is not None),
         ),
         ("seeds", seeds),
         (

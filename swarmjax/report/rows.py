@@ -18,25 +18,18 @@ import numpy as np
 
 from swarmjax.config import ConfigError, reading
 from swarmjax.evaluate.statistics import iqm
-from swarmjax.run import recorder
-from swarmjax.run.load_settings import from_stored
+from swarmjax.run import load_settings
+from swarmjax.run.directory import CONFIG, DECISIONS, METRICS, SUMMARY
 from swarmjax.run.settings import TrainConfig
 
 Row = dict[str, Any]
 
 # Each stage's newest verdict, in the order of the stages.
-BY_STAGE = (
-    "success_by_stage",
-    "complete_by_stage",
-    "contacts_by_stage",
-    "return_by_stage",
-)
+BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
 _LISTS = ("mix", "weights", *BY_STAGE)
 # Numbers of a whole update; the first two cover the episodes that ended in it.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # with more stages than this, each is drawn small
-SUMMARY = "summary.json"
-_NUMBERS = ("seed", "update", "arena_steps")
 _LARGEST = float(np.finfo(np.float32).max)
 # A verdict takes two cohorts: its episodes begin in the first and the last of them end in the next.
 _COHORTS_OF_A_VERDICT = 2
@@ -123,16 +116,49 @@ def read(run: Path) -> History:
       ConfigError: if a file is missing or damaged, or a seed has no row.
     """
     trained = read_config(run)
-    stages = len(trained.stage)
-    by_seed: dict[int, dict[int, Row]] = {}
-    for where, raw in read_lines(run, recorder.METRICS):
-        row = _checked(raw, stages, where)
-        by_seed.setdefault(row["seed"], {})[row["update"]] = row
+    by_seed = _read_metrics(run, len(trained.stage))
     updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
     if not updates:
-        raise ConfigError(f"{run / recorder.METRICS} has no update of every seed: train it first.")
-    summary = read_object(run / SUMMARY) if (run / SUMMARY).exists() else {}
-    return _history(trained, by_seed, updates, (_read_decisions(run), summary))
+        raise ConfigError(f"{run / METRICS} has no update of every seed: train it first.")
+    seeds = sorted(by_seed)
+    rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
+    lists, curves = (
+        np.array([[row[key] for row in of_seed] for of_seed in rows]) for key in ("lists", "curves")
+    )
+    columns = dict(zip(_LISTS, np.moveaxis(lists, 2, 0), strict=True))
+    mix = np.nan_to_num(columns["mix"])
+    return History(
+        config=trained,
+        seeds=np.array(seeds),
+        updates=np.array(updates),
+        arena_steps=np.array([row["arena_steps"] for row in rows[0]]),
+        mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
+        weights=np.nan_to_num(columns["weights"]),
+        by_stage={key: columns[key] for key in BY_STAGE},
+        curves=dict(zip(CURVES, np.moveaxis(curves, 2, 0), strict=True)),
+        seconds=rows[0][-1]["train_s"],
+        decisions=_read_decisions(run),
+        summary=read_object(run / SUMMARY) if (run / SUMMARY).exists() else {},
+    )
+
+
+def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
+    """Reads what a report needs of each row, by seed and update, as arrays, which need less memory.
+
+    `lists` are the values of `_LISTS`, [K, S], and `curves` those of `CURVES`, with nan for null.
+    """
+    by_seed: dict[int, dict[int, Row]] = {}
+    for where, row in read_lines(run, METRICS):
+        check(row, ("seed", "update", "arena_steps"), WHOLE, where)
+        check(row, ("train_s", *CURVES), NUMBER_OR_NULL, where)
+        check(row, _LISTS, list_of(NUMBER_OR_NULL, stages), where)
+        by_seed.setdefault(row["seed"], {})[row["update"]] = {
+            "arena_steps": row["arena_steps"],
+            "train_s": row.get("train_s"),
+            "lists": np.array([row[key] for key in _LISTS], np.float32),
+            "curves": np.array([row.get(key) for key in CURVES], np.float32),
+        }
+    return by_seed
 
 
 def measure(history: History) -> str:
@@ -191,55 +217,6 @@ def side_text(sides: tuple[float, float]) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def _history(
-    trained: TrainConfig,
-    by_seed: dict[int, dict[int, Row]],
-    updates: list[int],
-    rest: tuple[list[Row], Row],
-) -> History:
-    """Arranges the rows by seed and update."""
-    seeds = sorted(by_seed)
-    rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
-    lists = np.array([[row["lists"] for row in of_seed] for of_seed in rows])
-    curves = np.array([[row["curves"] for row in of_seed] for of_seed in rows])
-    every = np.moveaxis(lists, 2, 0)
-    columns = dict(zip(_LISTS, every, strict=True))
-    mix = np.nan_to_num(columns["mix"])
-    return History(
-        config=trained,
-        seeds=np.array(seeds),
-        updates=np.array(updates),
-        arena_steps=np.array([row["arena_steps"] for row in rows[0]]),
-        mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
-        weights=np.nan_to_num(columns["weights"]),
-        by_stage={key: columns[key] for key in BY_STAGE},
-        curves=dict(zip(CURVES, np.moveaxis(curves, 2, 0), strict=True)),
-        seconds=rows[0][-1].get("train_s"),
-        decisions=rest[0],
-        summary=rest[1],
-    )
-
-
-def _checked(raw: Row, stages: int, where: str) -> Row:
-    """Takes the values that a report needs from a row.
-
-    Lists become one float32 array [.., S]. The curves become one array, with nan for a missing
-    one.
-    """
-    for key in (*_NUMBERS, *_LISTS):
-        if key not in raw:
-            raise ConfigError(
-                f"{where} has no {key}: the run is from a version that did not write it."
-            )
-    check(raw, _NUMBERS, WHOLE, where)
-    check(raw, ("train_s", *CURVES), NUMBER_OR_NULL, where)
-    lists = [per_stage(raw[key], stages, f"{where} has {key}") for key in _LISTS]
-    return {key: raw[key] for key in (*_NUMBERS, "train_s") if key in raw} | {
-        "lists": np.array(lists),
-        "curves": np.array([raw.get(key) for key in CURVES], np.float32),
-    }
-
-
 def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: str) -> None:
     """Checks that values of a row have the given kind.
 
@@ -257,40 +234,17 @@ def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: s
             raise ConfigError(f"{where} has no {kind.name} as {key}: it is damaged.")
 
 
-def per_stage(found: object, stages: int, what: str) -> np.ndarray:
-    """Checks a list that holds a finite number or null for each stage.
-
-    Args:
-      found: the value as recorded.
-      stages: number of stages.
-      what: names the value in the message.
-
-    Returns:
-      [S] float32 with nan for null.
-
-    Raises:
-      ConfigError: if it is anything else.
-    """
-    fits = isinstance(found, list) and len(found) == stages and all(map(NUMBER_OR_NULL.fits, found))
-    if not fits:
-        raise ConfigError(f"{what}, which is not a list of {stages} numbers, one per stage.")
-    return np.array(found, np.float32)
-
-
 def read_config(run: Path) -> TrainConfig:
     """Reads the config of a run.
 
     Raises:
       ConfigError: if there is no config, or it is invalid.
     """
-    path = run / "config.json"
-    if not path.exists():
-        raise ConfigError(f"{run} is no run directory: it has no config.json.")
-    stored = read_object(path)
+    stored = load_settings.read_config(run)
     try:
-        return from_stored(stored)
+        return load_settings.from_stored(stored)
     except ConfigError as error:
-        raise ConfigError(f"{path} is not valid: {error}") from None
+        raise ConfigError(f"{run / CONFIG} is not valid: {error}") from None
 
 
 def read_object(path: Path) -> Row:
@@ -299,20 +253,20 @@ def read_object(path: Path) -> Row:
     Raises:
       ConfigError: if the file cannot be read, or holds something else.
     """
-    found = reading.read_json(path)
-    if not MAP.fits(found):
+    content = reading.read_json(path)
+    if not MAP.fits(content):
         raise ConfigError(f"{path} holds no keys and values: it is damaged.")
-    return found
+    return content
 
 
 def _read_decisions(run: Path) -> list[Row]:
     """Reads the decisions of the curriculum, sorted by seed and update."""
-    found = []
-    for where, row in read_lines(run, recorder.DECISIONS):
+    decisions = []
+    for where, row in read_lines(run, DECISIONS):
         check(row, ("seed", "update"), WHOLE, where)
         check(row, ("targets_reached", "all_reached"), NUMBER_OR_NULL, where)
-        found.append(row)
-    return sorted(found, key=lambda row: (row["seed"], row["update"]))
+        decisions.append(row)
+    return sorted(decisions, key=lambda row: (row["seed"], row["update"]))
 
 
 def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
@@ -341,9 +295,9 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
 def _object(line: bytes, where: str) -> Row:
     """Reads one line."""
     try:
-        found = reading.parse_json(line.decode(), where)
+        row = reading.parse_json(line.decode(), where)
     except (ConfigError, UnicodeDecodeError):
-        found = None
-    if not isinstance(found, dict):
+        row = None
+    if not isinstance(row, dict):
         raise ConfigError(f"{where} is damaged: resume the run, or remove the line.")
-    return found
+    return row

@@ -20,14 +20,14 @@ def of_run(run: Path, history: History) -> list[Logger]:
     asked = history.config.run
     weights_and_biases.check(history.config)
     boards = Boards(run, history.config.numbers, history.names)
-    found: list[Logger] = [boards] if asked.tensorboard else []
-    found += [WandbRuns(history.config, run)] if asked.wandb else []
-    if not found:
+    loggers: list[Logger] = [boards] if asked.tensorboard else []
+    loggers += [WandbRuns(history.config, run)] if asked.wandb else []
+    if not loggers:
         raise ConfigError(
             "send is true, but the run has no logger for figures: its run.tensorboard is false and "
             "its run.wandb is null."
         )
-    return found
+    return loggers
 
 
 def send(history: History, files: Sequence[Path], loggers: Sequence[Logger]) -> None:

@@ -78,8 +78,8 @@ class TableLine:
         """The ends of the mean's 95 % interval over seeds; None for fewer than three seeds."""
         if len(self.measured) < LEAST_DRAWN:
             return None
-        found = bootstrap(self.measured[:, None], np.mean)
-        return found.low, found.high
+        mean = bootstrap(self.measured[:, None], np.mean)
+        return mean.low, mean.high
 
 
 def find(text: str) -> list[Path]:
@@ -96,7 +96,7 @@ def find(text: str) -> list[Path]:
       ConfigError: if an entry names no run, or a run is named twice.
     """
     check_text("runs", text)
-    found: list[Path] = []
+    runs: list[Path] = []
     for part in [text] if os.path.isdir(text) else text.split(","):
         named = sorted(glob(part)) if set(part) & set("*?[") else [part]
         within = [run for path in named for run in _within(Path(path), part)]
@@ -104,11 +104,11 @@ def find(text: str) -> list[Path]:
             raise ConfigError(
                 f"runs is {show(text)}, but {show(part)} names neither a run nor a folder of runs."
             )
-        found += within
-    twice = [str(run) for run in found if found.count(run) > 1]
+        runs += within
+    twice = [str(run) for run in runs if runs.count(run) > 1]
     if twice:
         raise ConfigError(f"runs is {show(text)}, which names {twice[0]} twice: give it once.")
-    return found
+    return runs
 
 
 def _within(path: Path, part: str, deep: int = _DEEP) -> Iterator[Path]:

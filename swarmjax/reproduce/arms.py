@@ -40,11 +40,7 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
     if arm == first:
         trainer += [f"stage={_STAGES[kind]}", f"budget={given.budget}"]
     else:
-        trainer += [
-            "stage=paper_expanded",
-            f"budget={given.fine_tune}",
-            f"init_from={out / first}",
-        ]
+        trainer += ["stage=paper_expanded", f"budget={given.fine_tune}", f"init_from={out / first}"]
     made, _ = load_run(
         [
             *trainer,

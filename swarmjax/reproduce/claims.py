@@ -25,7 +25,6 @@ GENERATED = 0.8  # share of targets that counts as the desired behaviour; also p
 FAILED = 0.5  # below this share of targets a swarm fails
 HELD = {True: "holds", False: "contradicted", None: "open"}
 
-type Outcome = Literal["reproduced", "not reproduced", "undecidable"]
 # The value of each seed of an arm, [N]: a function of `measures` with its options set.
 type Values = Callable[[Reproduction, str], np.ndarray]
 type Source = tuple[str, Values]  # with its name in words
@@ -65,7 +64,7 @@ class Claim(NamedTuple):
     """A claim in the paper's text.
 
     Attributes:
-      name: key of the claim.
+      name: key of the claim in `claims.yaml`.
       quote: the paper's sentence, word for word.
       where: where the paper says it.
       criterion: what supports the claim, and what contradicts it.
@@ -82,17 +81,10 @@ class Claim(NamedTuple):
 
 
 class ClaimVerdict(NamedTuple):
-    """The verdict on a claim.
-
-    Attributes:
-      claim: the claim.
-      outcome: the verdict.
-      reason: why the claim is undecidable; empty if it is decided.
-      findings: the results of the readings.
-    """
+    """The verdict on a claim: the outcome, why it is open if it is, and the readings' findings."""
 
     claim: Claim
-    outcome: Outcome
+    outcome: Literal["reproduced", "not reproduced", "undecidable"]
     reason: str
     findings: tuple[Finding, ...]
 
@@ -101,17 +93,14 @@ def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
     """Judges a claim by all of its readings."""
     findings = tuple(evaluate(data, reading) for reading in claim.readings)
     held = {each.holds for each in findings}
-    outcome: Outcome = "undecidable"
-    reason = ""
-    if held == {True}:
-        outcome = "reproduced"
-    elif held == {False}:
-        outcome = "not reproduced"
-    elif any(data.lacking(reading.arms) for reading in claim.readings):
+    if len(held) == 1 and None not in held:
+        return ClaimVerdict(
+            claim, "reproduced" if held == {True} else "not reproduced", "", findings
+        )
+    reason = "readings disagree" if {True, False} <= held else "a reading is open"
+    if any(data.lacking(reading.arms) for reading in claim.readings):
         reason = "an arm is missing"
-    else:
-        reason = "readings disagree" if {True, False} <= held else "a reading is open"
-    return ClaimVerdict(claim, outcome, reason, findings)
+    return ClaimVerdict(claim, "undecidable", reason, findings)
 
 
 def evaluate(data: Reproduction, reading: Reading) -> Finding:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, about, files, show
-from swarmjax.config.section import MAX_COUNT, build_stored
+from swarmjax.config.section import MAX_COUNT as _MOST
+from swarmjax.config.section import build_stored
 from swarmjax.evaluate.statistics import LEAST_DRAWN
 
 # docs/paper.md describes the runs of a reproduction.
@@ -29,43 +30,28 @@ class ReproduceConfig(Section):
 
     command: ClassVar[str] = "reproduce"
 
-    seeds: int = field(
-        default=10, metadata=about("seeds of each arm; an interval needs three", LEAST_DRAWN, 4096)
-    )
-    budget: int = field(
-        default=1_000_000,
-        metadata=about("control steps per seed: 'max training timesteps'", UPDATE, MAX_COUNT),
-    )
-    fine_tune: int = field(
-        default=250_000,
-        metadata=about("control steps per seed in the 1.5 m arena", UPDATE, MAX_COUNT),
-    )
+    seeds: int = field(default=10, metadata=about("seeds of each arm", LEAST_DRAWN, 4096))
+    budget: int = field(default=1_000_000, metadata=about("control steps of a seed", UPDATE, _MOST))
+    fine_tune: int = field(default=250_000, metadata=about("the same at 1.5 m", UPDATE, _MOST))
     arms: tuple[Arm, ...] = field(
         default=ARMS, metadata=about("arms to train; NAME_expanded continues arm NAME")
     )
     minutes: float | None = field(
-        default=None,
-        metadata=about("save and stop after this time; resume continues", above=0.0),
+        default=None, metadata=about("save and stop after this time; resume continues", above=0.0)
     )
-    episodes: int = field(
-        default=20, metadata=about("episodes to judge each policy on each stage", 1, MAX_COUNT)
-    )
+    episodes: int = field(default=20, metadata=about("episodes to judge on a stage", 1, _MOST))
     workers: int | None = field(
         default=None, metadata=about("processes that judge; null: one per core", 1, 1024)
     )
     out: str | None = field(
         default=None, metadata=about("directory; null: runs/<date>-<time>-reproduce")
     )
-    resume: str | None = field(
-        default=None, metadata=about("directory of a reproduction to continue")
-    )
+    resume: str | None = field(default=None, metadata=about("reproduction to continue"))
 
     def _check(self) -> None:
         if not self.arms:
             raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
         for arm in self.arms:
-            if self.arms.count(arm) > 1:
-                raise ConfigError(f"arms names {arm} more than once: give each once.")
             first = arm.removesuffix("_expanded")
             if first not in self.arms:
                 raise ConfigError(f"arms names {arm}, but not {first}, which it continues.")

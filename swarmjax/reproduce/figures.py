@@ -6,7 +6,7 @@ universal design". Arms also have different dashes.
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,20 +20,14 @@ from swarmjax.evaluate import statistics
 from swarmjax.evaluate.statistics import curve, iqm
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
-from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
+from swarmjax.reproduce.measures import AXES, FINAL, SHARE, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
 SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
 _POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
-COLOURS = {
-    "curriculum": "#0072b2",
-    "baseline": "#d55e00",
-    "curriculum_expanded": "#0072b2",
-    "baseline_expanded": "#d55e00",
-    "modern_curriculum": "#009e73",
-    "modern_baseline": "#aa4499",
-}
-_DASHES = {"baseline": "--", "baseline_expanded": "--", "modern_baseline": "--"}
+COLOURS = {"curriculum": "#0072b2", "baseline": "#d55e00"}
+COLOURS |= {f"{arm}_expanded": colour for arm, colour in COLOURS.items()}
+COLOURS |= {"modern_curriculum": "#009e73", "modern_baseline": "#aa4499"}
 _LABELS: dict[Measure, str] = {
     measures.targets: "targets reached",
     measures.first_reward: "reward of robot 1 (m)",
@@ -69,7 +63,7 @@ class Panel(NamedTuple):
         return f"{_LABELS[self.of]},\n{which}"
 
 
-def draw(data: Reproduction) -> dict[str, bytes]:
+def png_files(data: Reproduction) -> dict[str, bytes]:
     """Draws every figure with at least one finished arm.
 
     Returns:
@@ -115,57 +109,44 @@ def curves(
         place.set_xlim(left=0)
         place.xaxis.set_major_formatter(drawing.thousands(least=10_000))
         place.xaxis.set_major_locator(MaxNLocator(5))
-    _explain_curves(figure, data, arms)
+    kinds = [Line2D([], [], lw=2.0, label=arm, **_style(arm)) for arm in arms]
+    kinds.append(Line2D([], [], color="0.5", lw=0.5, label=f"each of {len(data.seeds)} seeds"))
+    drawing.explain(figure, kinds)
     return figure
+
+
+def _style(arm: str) -> dict[str, Any]:
+    return {"color": COLOURS[arm], "ls": "--" if "baseline" in arm else "-"}
 
 
 def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) -> None:
     """Draws the rolling means of an arm."""
-    seeds = []
+    seeds, colour = [], COLOURS[arm]
     for log in data.logs[arm]:
         chosen = log.on(panel.stage)
         at = measures.along(chosen, axis)[WINDOW - 1 :]
         means = measures.rolling(np.asarray(panel.of(chosen), float))
         seeds.append((at, means))
         every = max(1, len(at) // 500)  # about one point per pixel
-        place.plot(at[::every], means[::every], color=COLOURS[arm], lw=0.5, alpha=0.35)
+        place.plot(at[::every], means[::every], color=colour, lw=0.5, alpha=0.35)
     shared = measures.on_grid(seeds, _POINTS)
     if shared is None:
         return
     band = curve(shared[1], resamples=_RESAMPLES)
-    place.fill_between(shared[0], band.low, band.high, color=COLOURS[arm], alpha=0.25, lw=0)
-    style = _DASHES.get(arm, "-")
-    place.plot(shared[0], band.estimate, style, color=COLOURS[arm], lw=2.0)
-
-
-def _explain_curves(figure: Figure, data: Reproduction, arms: tuple[str, ...]) -> None:
-    """Adds a legend of the arms above the panels."""
-    kinds = [
-        Line2D([], [], color=COLOURS[arm], lw=2.0, ls=_DASHES.get(arm, "-"), label=arm)
-        for arm in arms
-    ]
-    kinds.append(Line2D([], [], color="0.5", lw=0.5, label=f"each of {len(data.seeds)} seeds"))
-    drawing.explain(figure, kinds)
+    place.fill_between(shared[0], band.low, band.high, color=colour, alpha=0.25, lw=0)
+    place.plot(shared[0], band.estimate, lw=2.0, **_style(arm))
 
 
 def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
     """Draws the results of the final policies on both stages: every seed, and intervals."""
-    kinds = {
-        "targets_reached": "targets reached",
-        "all_reached": "episodes in which all arrived",
-        "sensed_share": "robot steps within infrared range",
-        "contacts_per_robot": "contacts per robot and episode",
-    }
     figure = Figure(figsize=(drawing.WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
     places = figure.subplots(2, 2, sharey=True)
-    for place, (key, label) in zip(places.flat, kinds.items(), strict=True):
+    for place, (key, (label, unit)) in zip(places.flat, FINAL.items(), strict=False):
         for shift, stage, mark in ((-0.16, LAST, "o"), (0.16, EXPANDED, "s")):
             for row, arm in enumerate(arms):
                 _dots(place, data.judged[arm, stage][key], row + shift, (COLOURS[arm], mark))
-        place.set_title(label, loc="left", fontsize=9)
-        place.grid(axis="x", alpha=0.3)
-        place.tick_params(labelsize=8)
-        if key != "contacts_per_robot":
+        drawing.dress(place, label, 9)
+        if unit is SHARE:
             place.xaxis.set_major_formatter(drawing.percent())
         place.set_xlim(left=max(0.0, place.get_xlim()[0]))
     places[0, 0].set_yticks(range(len(arms)), arms)

@@ -13,20 +13,13 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import builder
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
+from swarmjax.reproduce.measures import FINAL, NUMBER, PLACE, Unit
 from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, MODERN, PAIR, Reproduction
 
 PAGE, FIGURES = "report.html", "figures"
 # Both readings of success, over all episodes and over those on the last stage.
 _CASES = (*claims.steady(None, "episode"), *claims.steady(LAST, "steps"))
 _OUTCOMES = ("reproduced", "not reproduced", "undecidable")
-_COLUMNS: dict[str, tuple[str, Unit]] = {
-    "targets_reached": ("targets reached", SHARE),
-    "all_reached": ("all reached", SHARE),
-    "sensed_share": ("steps within infrared range", SHARE),
-    "contacts_per_robot": ("contacts per robot", NUMBER),
-    "return": ("return per robot (m)", NUMBER),
-}
 
 
 def write(out: Path) -> Path:
@@ -45,7 +38,7 @@ def write(out: Path) -> Path:
     # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.reproduce import figures as reproduce_figures
 
-    figures = reproduce_figures.draw(data)
+    figures = reproduce_figures.png_files(data)
     lacks = {name: data.lacking(plot.arms) for name, plot in reproduce_figures.PLOTS.items()}
     content = {f"{FIGURES}/{name}.png": png for name, png in figures.items()}
     content[PAGE] = _page(data, figures, lacks).encode()
@@ -86,9 +79,9 @@ def _page(
         expanded_stage=EXPANDED,
         figures=figures,
         lacks=lacks,
-        final_heads=("arm", "on", *(label for label, _ in _COLUMNS.values())),
+        final_heads=("arm", "on", *(label for label, _ in FINAL.values())),
         final=[
-            (arm, on, *(_mean(values[key], unit) for key, (_, unit) in _COLUMNS.items()))
+            (arm, on, *(_mean(values[key], unit) for key, (_, unit) in FINAL.items()))
             for (arm, on), values in data.judged.items()
         ],
         window=measures.WINDOW,

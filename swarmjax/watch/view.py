@@ -106,7 +106,7 @@ class Views:
             check_regular(self.run)
             self.trained = rows.read_config(self.run)
             history = rows.read(self.run)
-            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures.draw(history))
+            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures.png_files(history))
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.drawn = self.drawn._replace(trouble=str(error))
         self._seen = version

@@ -62,7 +62,7 @@ def test_an_unfinished_last_line_is_skipped(tmp_path: Path) -> None:
         (
             "metrics.jsonl",
             json.dumps(row(0, broken_arenas=0, success_by_stage=[0.5])) + "\n",
-            " in line 1 has success_by_stage, which is not a list of 2 numbers, one per stage.",
+            " in line 1 has no list of 2 numbers as success_by_stage: it is damaged.",
         ),
         ("summary.json", "{}", " has no seeds: it is damaged."),
         ("summary.json", "[]", " holds no keys and values: it is damaged."),

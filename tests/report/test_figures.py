@@ -173,8 +173,8 @@ def test_a_run_without_these_numbers_has_no_curves(tmp_path: Path) -> None:
 def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
     wide = _wide_row([0.1, 0.2, None, 0.4, 0.5], entropy=1.0)
     history = _history(tmp_path, [wide], _stages([(2, 0, 0.5 + 0.1 * i) for i in range(5)]))
-    files = report_figures.draw(history)
+    files = report_figures.png_files(history)
     assert list(files) == ["mix", "success", "curves"]
     assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
     assert not any(b"Matplotlib" in content for content in files.values())
-    assert report_figures.draw(history) == files
+    assert report_figures.png_files(history) == files

@@ -8,7 +8,7 @@ import pytest
 from reproductions import log, reproduction
 
 from swarmjax.reproduce import claims
-from swarmjax.reproduce.claims import CLAIMS, Outcome
+from swarmjax.reproduce.claims import CLAIMS
 from swarmjax.reproduce.config import ARMS
 from swarmjax.reproduce.criteria import about, crowded, earlier, higher, opposite, within
 from swarmjax.reproduce.measures import NUMBER, SHARE
@@ -27,7 +27,7 @@ def _steady_from(number: int) -> list:
     return [log([False] * (number - 1) + [True] * (61 - number))] * 3
 
 
-def _outcome(data: Reproduction, name: str) -> Outcome:
+def _outcome(data: Reproduction, name: str) -> str:
     return claims.verdict(data, BY_NAME[name]).outcome
 
 

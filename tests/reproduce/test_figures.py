@@ -104,7 +104,7 @@ def test_final_policies_have_their_seeds_and_intervals() -> None:
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     out = whole(tmp_path_factory.mktemp("out"), episodes=25, arms=("curriculum",))
-    return figures.draw(reproduce_rows.read(out))
+    return figures.png_files(reproduce_rows.read(out))
 
 
 def test_figures_of_arms_that_have_not_finished_are_left_out(drawn: dict[str, bytes]) -> None:

@@ -104,7 +104,6 @@ def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
         (["arms=[]"],
          "arms is []: give some of curriculum, baseline, curriculum_expanded, baseline_expanded, "
          "modern_curriculum, modern_baseline."),
-        (["arms=[baseline,baseline]"], "arms names baseline more than once: give each once."),
         (["arms=[baseline_expanded]"],
          "arms names baseline_expanded, but not baseline, which it continues."),
         (["minutes=0"], "minutes is 0: give more than 0."),
