@@ -1,38 +1,49 @@
-"""How is the time of an update divided among physics, sensors, policy and learning?
+"""Where do the time and the memory of an update go?
 
-`python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`. It
-traces three calls: physics alone, the environment including physics, and training including both.
-For each call it prints a JSON line for all kernels together, and a line for each of the `top`
-slowest kernels. A line has the microseconds per control step of all arenas. A kernel's line also
-has the kernel's share of the time of all kernels.
+`python -m benchmarks.profile [of=time|memory] [top=40] [key=value ...]` takes the keys of
+`swarmjax.train`.
 
-On a GPU, the kernels are those of the GPU's streams. On a CPU, the kernels are XLA's operations,
-and their times are summed over all threads. `busy` is the time of all kernels divided by the time
-of the call. `busy` is above 1 if several threads or streams ran at once.
+`of=time` traces three calls: physics alone, the environment including physics, and training
+including both. For each call it prints a JSON line for all kernels together, and a line for each of
+the `top` slowest kernels. A line has the microseconds per control step of all arenas. A kernel's
+line also has the kernel's share of the time of all kernels. On a GPU, the kernels are those of the
+GPU's streams. On a CPU, the kernels are XLA's operations, and their times are summed over all
+threads. `busy` is the time of all kernels divided by the time of the call. `busy` is above 1 if
+several threads or streams ran at once.
+
+`of=memory` trains for two updates and prints a JSON line with four sizes in bytes. They are the
+memory that the compiled program needs by XLA's analysis, the peak of XLA's allocator, the peak of
+Warp's own allocator, and the drop in the GPU's free memory. XLA's sizes do not include Warp's
+allocations. A peak covers a whole process, so measure one size per process. Set
+XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last size is the memory that XLA preallocates. On
+a CPU only the size in XLA's analysis is available.
 """
 
-import json
+import importlib.util
 import operator
 import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from benchmarks import steps_per_second
+from benchmarks import lines, steps_per_second, timing
 from swarmjax import command
+from swarmjax.config import Section, about
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
+from swarmjax.sim import dispatch
+from swarmjax.training import program as programs
+from swarmjax.training import seeds
 
-TOP = 40
-UPDATES = 2  # number of updates in the traced call of training
+UPDATES = 2  # number of updates in the measured call of training
 # Kernels run on the threads or streams whose names contain this text, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
 # Prefixes of events that are not counted: some only mark the end of a region, and a loop's contents
@@ -44,6 +55,14 @@ KINDS = {
     "sort": ("sort", "Sort"),
     "copy": ("memcpy", "Memcpy", "MemcpyD2D", "copy"),
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileConfig(Section):
+    """Settings: what to measure."""
+
+    of: Literal["time", "memory"] = field(default="time", metadata=about("what is divided"))
+    top: int = field(default=40, metadata=about("kernels to list", 1, 10**6))
 
 
 def kind(name: str) -> str:
@@ -87,11 +106,11 @@ def _events(folder: Path) -> Iterator[tuple[str, float]]:
                     )
 
 
-def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) -> list[dict]:
+def rows(given: dict[str, Any], call: Callable[[], Any], steps: int, top: int) -> list[lines.Line]:
     """Profiles a call.
 
     Args:
-      about: entries that every line has.
+      given: entries that every line has.
       call: the function to call, which has run before; it returns arrays.
       steps: control steps per call.
       top: number of kernels to list.
@@ -110,7 +129,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
         "busy": total / seconds,
         "kernels_per_control_step": sum(count.values()) / steps,
         "shares": {name: taken / total for name, taken in _most(by_kind)},
-        **steps_per_second.made_with(),
+        **lines.made_with(),
     }
     each = [
         {
@@ -122,7 +141,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
         }
         for kernel, taken in _most(spent)[:top]
     ]
-    return [about | one for one in (whole, *each)]
+    return [given | one for one in (whole, *each)]
 
 
 def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
@@ -130,11 +149,11 @@ def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
     return sorted(seconds.items(), key=operator.itemgetter(1), reverse=True)
 
 
-def results(settings: TrainConfig, top: int) -> Iterator[dict]:
+def profile(settings: TrainConfig, top: int) -> Iterator[lines.Line]:
     """Profiles physics, environment and training, and yields their lines."""
     prepared = steps_per_second.prepare(settings)
     schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout_length
-    about = {"arenas": settings.arenas, "robot": settings.robot.body}
+    given = {"arenas": settings.arenas, "robot": settings.robot.body}
     steps = steps_per_second.CONTROL_STEPS[settings.robot.body]
     for name, program, argument, count in (
         ("physics", prepared.physics, keys, steps),
@@ -145,19 +164,69 @@ def results(settings: TrainConfig, top: int) -> Iterator[dict]:
         state = state if name == "training" else state.arenas
         state, _ = program.call(state, argument)
         call = partial(program.call, state, argument)
-        yield from lines({"benchmark": f"profile.{name}", **about}, call, count, top)
+        yield from rows({"benchmark": f"profile.{name}", **given}, call, count, top)
+
+
+def memory(settings: TrainConfig) -> lines.Line:
+    """Trains for two updates and returns the JSON line."""
+    free = free_bytes()
+    program, schedule = programs.load(settings)
+    init = partial(seeds.init, program)
+    train = partial(seeds.train_chunk, program, schedule)
+    template = jax.eval_shape(init, schedule)
+    compiled = timing.compile_program(train, template, np.int32(1))
+    state = jax.jit(init)(schedule)
+    state_bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(template))
+    jax.block_until_ready(compiled.call(state, np.int32(UPDATES)))
+    statistics = jax.devices()[0].memory_stats() or {}
+    left = free_bytes()
+    return {
+        "benchmark": "memory",
+        **steps_per_second.about(settings),
+        "state_bytes": state_bytes,
+        "program_bytes": compiled.size,
+        "peak_bytes": statistics.get("peak_bytes_in_use"),
+        "warp_bytes": warp_bytes(settings),
+        "device_bytes": None if free is None or left is None else free - left,
+        "compile_s": compiled.compile_s,
+        **lines.made_with(),
+    }
+
+
+def free_bytes() -> int | None:
+    """Asks Warp for the free bytes of the first NVIDIA GPU; None without a GPU or without Warp."""
+    card = _card()
+    return None if card is None else int(card.free_memory)
+
+
+def warp_bytes(settings: TrainConfig) -> int | None:
+    """Returns the peak bytes of Warp's allocator; None if training does not use Warp on a GPU."""
+    card = _card()
+    if card is None or dispatch.resolve_impl(settings.sim.impl) != "warp":
+        return None
+    import warp
+
+    return int(warp.get_mempool_used_mem_high(card))
+
+
+def _card() -> Any:
+    """Returns Warp's first CUDA device; None without CUDA or without Warp."""
+    if importlib.util.find_spec("warp") is None:
+        return None
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+    return warp.get_device("cuda:0") if warp.is_cuda_available() else None
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    tops, words = steps_per_second.split(arguments, "top")
-    settings = load_train(["stage=s6", *words])
+    given, words = lines.parse(ProfileConfig, arguments)
+    settings = load_train(["stage=s6", "budget=1e10", *words])
     settings = replace(settings, stage=settings.stage[-1:])
-    for line in results(settings, int(tops[0]) if tops else TOP):
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
+    lines.write([memory(settings)] if given.of == "memory" else profile(settings, given.top))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(command.run("profile", main, TrainConfig))
+    sys.exit(command.run("profile", main, ProfileConfig))
