@@ -1,16 +1,15 @@
-"""Writes policies without learning, to which trained policies are compared.
+"""Writes a policy without learning, to which trained policies are compared.
 
-`python -m benchmarks.baselines out=FILE.npz [who=straight|still]` writes a policy that
-`swarmjax.evaluate policy=FILE.npz` judges like any other. `straight` drives straight to the target
-and ignores the infrared sensors: the turn rate is twice the bearing, and the speed falls with the
-bearing. `still` never moves.
+`python -m benchmarks.baselines out=FILE.npz` writes a policy that `swarmjax.evaluate
+policy=FILE.npz` judges like any other. It drives straight to the target and ignores the infrared
+sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
 """
 
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -21,36 +20,26 @@ from swarmjax.task import observation
 
 # The action (speed, turn rate; -1..1) at bearing 0, then the change of the action per radian of
 # bearing to the left, and per radian to the right.
-POLICIES = {
-    "straight": ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0)),
-    "still": ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0)),
-}
+AHEAD, SIDES = (1.0, 0.0), ((-2.0, 2.0), (-2.0, -2.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinesConfig(Section):
-    """Settings: which policy, and where it goes."""
+    """Settings: where the policy goes."""
 
     out: str = field(metadata=about("file .npz for the policy"))
-    who: Literal["straight", "still"] = field(default="straight", metadata=about("the policy"))
 
 
-def write(path: Path, ahead: Sequence[float], *sides: Sequence[float]) -> None:
-    """Writes a policy that is piecewise linear in the bearing.
-
-    Args:
-      path: path of the policy.
-      ahead: [2] action at bearing 0.
-      sides: change of the action [2] per radian of bearing to the left, and to the right.
-    """
+def write(path: Path) -> None:
+    """Writes the policy, which is piecewise linear in the bearing."""
     split = np.zeros((1, observation.SIZE, 2), np.float32)
     split[0, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
     none = np.zeros((1, observation.SIZE), np.float32)
     arrays = {
         "actor/hidden_0/kernel": split,
         "actor/hidden_0/bias": none[:, :2],
-        "actor/mean/kernel": np.array([sides], np.float32),
-        "actor/mean/bias": np.array([ahead], np.float32),
+        "actor/mean/kernel": np.array([SIDES], np.float32),
+        "actor/mean/bias": np.array([AHEAD], np.float32),
         "actor/log_std": none[:, :2] - 200.0,  # exp(-200) is 0 in float32
         "normalizer/mean": none,
         "normalizer/std": none + 1.0,
@@ -96,7 +85,7 @@ def meta(learners: int, activation: str) -> dict[str, Any]:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = lines.load(BaselinesConfig, arguments)
-    write(Path(settings.out), *POLICIES[settings.who])
+    write(Path(settings.out))
     return 0
 
 

@@ -180,15 +180,14 @@ def camar(words: Sequence[str]) -> Iterator[Line]:
         )
         key = jax.random.key(config.seed)
         carry = (world.reset(key)[1], key)
-        program = timing.compile_program(partial(_camar_steps, world, config), carry, None)
-        calls_s, _ = timing.time_program(program, carry, None, config.repeats)
+        call = partial(_camar_steps, world, config)
+        calls_s, compiled = peers.timed(call, carry, None, config.repeats)
         yield {
             "benchmark": "peer_camar.environment",
             "peer": "CAMAR random_grid",
             **peers.speed(config, arenas, FRAMESKIP + 1, calls_s),
             "reset_ratio": ratio,
-            "compile_s": program.compile_s,
-            "program_bytes": program.size,
+            **compiled,
             **COUNTED["camar"],
             "settings": camar_task(config),
             **peers.with_jax("camar"),
@@ -253,15 +252,13 @@ def jaxnav(words: Sequence[str]) -> Iterator[Line]:
         for how in config.step:
             carry = (begin(pool, arenas)[1], jax.random.key(config.seed))
             call = partial(_jaxnav_steps, world, config, how)
-            program = timing.compile_program(call, carry, pool)
-            calls_s, _ = timing.time_program(program, carry, pool, config.repeats)
+            calls_s, compiled = peers.timed(call, carry, pool, config.repeats)
             yield {
                 "benchmark": "peer_jaxnav.environment",
                 "peer": f"JaxMARL JaxNav, {'step_env' if how == 'pool' else 'step'}",
                 "reset": how,
                 **peers.speed(config, arenas, 1, calls_s),
-                "compile_s": program.compile_s,
-                "program_bytes": program.size,
+                **compiled,
                 **COUNTED["jaxnav"],
                 "resets": RESETS[how],
                 "settings": jaxnav_task(config),

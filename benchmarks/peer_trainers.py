@@ -358,15 +358,13 @@ def jaxmarl_ippo(words: Sequence[str]) -> Iterator[Line]:
             return jax.lax.scan(partial(update, ippo, pool), carry, length=config.updates)
 
         carry = jax.jit(partial(init, ippo))(pool)
-        program = timing.compile_program(train, carry, pool)
-        calls_s, _ = timing.time_program(program, carry, pool, config.repeats)
+        calls_s, compiled = peers.timed(train, carry, pool, config.repeats)
         rate = config.updates * config.rollout * arenas / timing.spread(calls_s)["call_s"]
         yield {
             "benchmark": "peer_jaxmarl_ippo",
             "trainer": "JaxMARL IPPO, JaxNav",
             **peers.training(config.robots, arenas, rate, calls_s),
-            "compile_s": program.compile_s,
-            "program_bytes": program.size,
+            **compiled,
             "resets": peer_environments.RESETS["pool"],
             "settings": to_dict(config) | {"task": peer_environments.jaxnav_task(config)},
             **peers.with_jax("jaxmarl"),

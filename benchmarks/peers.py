@@ -158,6 +158,19 @@ def training(
     }
 
 
+def timed(
+    call: Callable[[Any, Any], Any], state: Any, argument: Any, repeats: int
+) -> tuple[list[float], dict[str, Any]]:
+    """Compiles and times a program in JAX, as `timing.compile_program` takes it.
+
+    Returns:
+      Seconds of each timed call, and the entries of a result line about the compiled program.
+    """
+    program = timing.compile_program(call, state, argument)
+    calls_s, _ = timing.time_program(program, state, argument, repeats)
+    return calls_s, {"compile_s": program.compile_s, "program_bytes": program.size}
+
+
 def with_jax(*packages: str) -> dict[str, Any]:
     """Returns the entries that give device, versions and commit of a peer that uses JAX."""
     return {
