@@ -1,25 +1,16 @@
-"""Where do the time and the memory of an update go?
+"""How is the time of an update divided among physics, sensors, policy and learning?
 
-`python -m benchmarks.profile [of=time|memory] [top=40] [key=value ...]` takes the keys of
-`swarmjax.train`.
+`python -m benchmarks.profile [top=40] [key=value ...]` takes the keys of `swarmjax.train`. It
+traces three calls: physics alone, the environment including physics, and training including both.
+For each call it prints a JSON line for all kernels together, and a line for each of the `top`
+slowest kernels. A line has the microseconds per control step of all arenas. A kernel's line also
+has the kernel's share of the time of all kernels.
 
-`of=time` traces three calls: physics alone, the environment including physics, and training
-including both. For each call it prints a JSON line for all kernels together, and a line for each of
-the `top` slowest kernels. A line has the microseconds per control step of all arenas. A kernel's
-line also has the kernel's share of the time of all kernels. On a GPU, the kernels are those of the
-GPU's streams. On a CPU, the kernels are XLA's operations, and their times are summed over all
-threads. `busy` is the time of all kernels divided by the time of the call. `busy` is above 1 if
-several threads or streams ran at once.
-
-`of=memory` trains for two updates and prints a JSON line with four sizes in bytes. They are the
-memory that the compiled program needs by XLA's analysis, the peak of XLA's allocator, the peak of
-Warp's own allocator, and the drop in the GPU's free memory. XLA's sizes do not include Warp's
-allocations. A peak covers a whole process, so measure one size per process. Set
-XLA_PYTHON_CLIENT_PREALLOCATE=false; otherwise the last size is the memory that XLA preallocates. On
-a CPU only the size in XLA's analysis is available.
+On a GPU, the kernels are those of the GPU's streams. On a CPU, the kernels are XLA's operations,
+and their times are summed over all threads. `busy` is the time of all kernels divided by the time
+of the call. `busy` is above 1 if several threads or streams ran at once.
 """
 
-import importlib.util
 import operator
 import sys
 import tempfile
@@ -29,21 +20,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 
-from benchmarks import lines, steps_per_second, timing
+from benchmarks import lines, steps_per_second
 from swarmjax import command
 from swarmjax.config import Section, about
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.sim import dispatch
-from swarmjax.training import program as programs
-from swarmjax.training import seeds
 
-UPDATES = 2  # number of updates in the measured call of training
+UPDATES = 2  # number of updates in the traced call of training
 # Kernels run on the threads or streams whose names contain this text, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
 # Prefixes of events that are not counted: some only mark the end of a region, and a loop's contents
@@ -59,9 +47,8 @@ KINDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileConfig(Section):
-    """Settings: what to measure."""
+    """Settings: what to list."""
 
-    of: Literal["time", "memory"] = field(default="time", metadata=about("what is divided"))
     top: int = field(default=40, metadata=about("kernels to list", 1, 10**6))
 
 
@@ -167,64 +154,12 @@ def profile(settings: TrainConfig, top: int) -> Iterator[lines.Line]:
         yield from rows({"benchmark": f"profile.{name}", **given}, call, count, top)
 
 
-def memory(settings: TrainConfig) -> lines.Line:
-    """Trains for two updates and returns the JSON line."""
-    free = free_bytes()
-    program, schedule = programs.load(settings)
-    init = partial(seeds.init, program)
-    train = partial(seeds.train_chunk, program, schedule)
-    template = jax.eval_shape(init, schedule)
-    compiled = timing.compile_program(train, template, np.int32(1))
-    state = jax.jit(init)(schedule)
-    state_bytes = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(template))
-    jax.block_until_ready(compiled.call(state, np.int32(UPDATES)))
-    statistics = jax.devices()[0].memory_stats() or {}
-    left = free_bytes()
-    return {
-        "benchmark": "memory",
-        **steps_per_second.about(settings),
-        "state_bytes": state_bytes,
-        "program_bytes": compiled.size,
-        "peak_bytes": statistics.get("peak_bytes_in_use"),
-        "warp_bytes": warp_bytes(settings),
-        "device_bytes": None if free is None or left is None else free - left,
-        "compile_s": compiled.compile_s,
-        **lines.made_with(),
-    }
-
-
-def free_bytes() -> int | None:
-    """Asks Warp for the free bytes of the first NVIDIA GPU; None without a GPU or without Warp."""
-    card = _card()
-    return None if card is None else int(card.free_memory)
-
-
-def warp_bytes(settings: TrainConfig) -> int | None:
-    """Returns the peak bytes of Warp's allocator; None if training does not use Warp on a GPU."""
-    card = _card()
-    if card is None or dispatch.resolve_impl(settings.sim.impl) != "warp":
-        return None
-    import warp
-
-    return int(warp.get_mempool_used_mem_high(card))
-
-
-def _card() -> Any:
-    """Returns Warp's first CUDA device; None without CUDA or without Warp."""
-    if importlib.util.find_spec("warp") is None:
-        return None
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-    return warp.get_device("cuda:0") if warp.is_cuda_available() else None
-
-
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     given, words = lines.parse(ProfileConfig, arguments)
     settings = load_train(["stage=s6", "budget=1e10", *words])
     settings = replace(settings, stage=settings.stage[-1:])
-    lines.write([memory(settings)] if given.of == "memory" else profile(settings, given.top))
+    lines.write(profile(settings, given.top))
     return 0
 
 

@@ -42,7 +42,6 @@ class SuiteEntry:
       run: the module in benchmarks/ and its `key=value` words.
       over: key whose several values are measured one by one.
       values: the values of `over`; each line has one of them.
-      each: number of values per process; None: all values in one process.
       seconds: time limit, s; a process that prints nothing for this long is ended.
       environment: environment variables of the process.
     """
@@ -51,7 +50,6 @@ class SuiteEntry:
     run: str
     over: str | None = None
     values: Sequence[int] = ()
-    each: int | None = None
     seconds: float = 300.0
     environment: dict[str, str] = field(default_factory=dict)
 
@@ -142,18 +140,16 @@ def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
     """
     waiting = left(entry, output.lines)
     while waiting:
-        values = waiting[: entry.each or len(waiting)]
-        rest = waiting[len(values) :]
-        process, first = Process(entry, values), len(output.lines)
+        process, first = Process(entry, waiting), len(output.lines)
         for line in process.lines(deadline):
             output.add({**line, "entry": entry.name})
         new = output.lines[first:]
         if process.late or any("skipped" in line for line in new):
             return
-        untried = [value for value in values if not any(_is_of(entry, value, x) for x in new)]
+        untried = [value for value in waiting if not any(_is_of(entry, value, x) for x in new)]
         if untried:
             output.add(_failed(entry, untried[0], process.reason))
-        waiting = [*untried[1:], *rest]
+        waiting = untried[1:]
 
 
 def _failed(entry: SuiteEntry, value: int | None, reason: str) -> Line:

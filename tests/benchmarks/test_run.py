@@ -153,13 +153,6 @@ def test_a_missing_peer_is_skipped_and_said(tmp_path: Path, script: Script) -> N
     assert line["skipped"] == "it is not installed"
 
 
-def test_each_value_may_have_a_process_of_its_own(tmp_path: Path, script: Script) -> None:
-    script("say(benchmark='m', arenas=int(values[0]), asked=len(values))")
-    entry = SuiteEntry(name="e", run="m", over="arenas", values=(8, 4), each=1, seconds=20.0)
-    found = _run(entry, tmp_path / "out.jsonl")
-    assert [(line["arenas"], line["asked"]) for line in found] == [(8, 1), (4, 1)]
-
-
 def test_a_file_of_something_else_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "thesis.txt"
     path.write_text("years of work")
