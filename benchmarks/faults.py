@@ -8,7 +8,6 @@ prints a summary of `out`. A line has the entries `campaign`, `trial`, `seed`, `
 """
 
 import json
-import os
 import sys
 import tempfile
 from collections import Counter
@@ -19,21 +18,19 @@ from typing import Any, NamedTuple
 
 from benchmarks import (
     faults_disk,
-    faults_hosts,
     faults_inputs,
-    faults_nan,
     faults_policies,
     faults_runs,
     faults_shared,
-    key_value,
+    lines,
 )
+from benchmarks.lines import Line, Output
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 
 Trial = Callable[[int, Path], dict[str, Any]]
 TABLE = "table"
-_BEGINNING = b'{"campaign'  # start of every line in `out`
 _STRIDE = 1_000_000  # maximum number of trials per campaign; each trial has its own seed
 
 
@@ -55,11 +52,10 @@ CAMPAIGNS: dict[str, Campaign] = {
     "terms": Campaign(faults_runs.terms, 50),
     "checkpoints": Campaign(faults_runs.checkpoints, 2000),
     "disk": Campaign(faults_disk.trial, 40),
-    "nan": Campaign(faults_nan.trial, 240),
+    "nan": Campaign(faults_disk.spoil, 240),
     "policies": Campaign(faults_policies.trial, 1000),
     "inputs": Campaign(faults_inputs.trial, 5000),
     "shared": Campaign(faults_shared.trial, 2000),
-    "hosts": Campaign(faults_hosts.trial, 10),
 }
 
 
@@ -82,73 +78,24 @@ class FaultsConfig(Section):
             raise ConfigError(f"campaign is {show(self.campaign)}: give one of {names}.")
 
 
-def parse(words: Sequence[str]) -> FaultsConfig:
-    """Makes the settings from `key=value` words.
-
-    Args:
-      words: words of the command line.
-
-    Raises:
-      ConfigError: a word is invalid.
-    """
-    return key_value.load(FaultsConfig, words)
-
-
-def read(out: Path) -> list[dict[str, Any]]:
-    """Reads the lines of a file, and skips an incomplete last line.
-
-    Args:
-      out: the file; it need not exist.
-
-    Raises:
-      ConfigError: a line is not a JSON object.
-    """
-    if not out.exists():
-        return []
-    found = []
-    for number, line in enumerate(out.read_text().splitlines(keepends=True), 1):
-        if not line.endswith("\n"):
-            break
-        try:
-            found.append(dict(json.loads(line)))
-        except (ValueError, TypeError):
-            raise ConfigError(f"{out} in line {number} is not a line of a campaign.") from None
-    return found
-
-
-def run(settings: FaultsConfig) -> Iterator[dict[str, Any]]:
+def run(settings: FaultsConfig) -> Iterator[Line]:
     """Runs the trials that are not yet in the file, and yields each line once it is written.
 
     Args:
       settings: the campaign's settings.
     """
-    out, campaign = Path(settings.out), CAMPAIGNS[settings.campaign]
+    output, campaign = Output(Path(settings.out)), CAMPAIGNS[settings.campaign]
     asked = (settings.campaign, settings.seed)
-    done = {row["trial"] for row in read(out) if (row["campaign"], row["seed"]) == asked}
-    _drop_torn(out)
+    done = {row["trial"] for row in output.lines if (row["campaign"], row["seed"]) == asked}
     commit = provenance.commit()
-    with out.open("a") as file:
-        for number in range(campaign.trials if settings.count is None else settings.count):
-            if number in done:
-                continue
-            with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-                told = campaign.trial(settings.seed * _STRIDE + number, Path(folder))
-            row = {"campaign": asked[0], "trial": number, "seed": asked[1], "commit": commit}
-            file.write(json.dumps(row | told) + "\n")
-            file.flush()
-            yield row | told
-
-
-def _drop_torn(out: Path) -> None:
-    """Removes a last line that was only partly written."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if not out.exists():
-        return
-    content = out.read_bytes()
-    whole = content.rfind(b"\n") + 1
-    if content and not whole and not content.startswith(_BEGINNING):
-        raise ConfigError(f"out is {out}, which holds no line of a campaign: give another file.")
-    os.truncate(out, whole)
+    for number in range(campaign.trials if settings.count is None else settings.count):
+        if number in done:
+            continue
+        with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+            told = campaign.trial(settings.seed * _STRIDE + number, Path(folder))
+        row = {"campaign": asked[0], "trial": number, "seed": asked[1], "commit": commit}
+        output.add(row | told)
+        yield row | told
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -184,11 +131,11 @@ def _most(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = parse(arguments)
+    settings = lines.load(FaultsConfig, arguments)
     if settings.campaign != TABLE:
         outcomes = Counter(row["outcome"] for row in run(settings))
         sys.stdout.write(f"tried now: {json.dumps(outcomes)}\n")
-    sys.stdout.write(table(read(Path(settings.out))) + "\n")
+    sys.stdout.write(table(lines.read(Path(settings.out))) + "\n")
     return 0
 
 

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax import epuck, policy, policy_file
+from benchmarks import baselines
+from swarmjax import policy, policy_file
 from swarmjax.policy import PolicyError
 from swarmjax.task import observation
 
@@ -52,43 +53,7 @@ def write_sound(path: Path, draw: random.Random) -> None:
     arrays["normalizer/mean"] = numbers.normal(size=(learners, observation.SIZE))
     arrays["normalizer/std"] = numbers.uniform(0.5, 2, (learners, observation.SIZE))
     floats = {name: array.astype(np.float32) for name, array in arrays.items()}
-    policy_file.write(path, floats, meta(learners))
-
-
-def meta(learners: int) -> dict[str, Any]:
-    """Returns the metadata of a policy.
-
-    Args:
-      learners: number of learners; 1 for a shared policy.
-    """
-    return {
-        "policy": "shared" if learners == 1 else "independent",
-        "learners": learners,
-        "activation": "tanh",
-        "observation": observation.describe("metric") | {"limit": 10.0},
-        "action": {
-            "names": policy_file.ACTION_NAMES,
-            "units": policy_file.ACTION_UNITS,
-            "low": [0.0, -epuck.MAX_TURN_RATE],
-            "high": [epuck.MAX_SPEED, epuck.MAX_TURN_RATE],
-        },
-        "robot": {
-            "preset": "planar",
-            "body": "planar",
-            "wheel_radius": epuck.WHEEL_RADIUS,
-            "track": epuck.TRACK,
-            "max_wheel_speed": epuck.MAX_WHEEL_SPEED,
-        },
-        "sensors": {"preset": "ideal", "response": "ideal", "range": epuck.SENSOR_RANGE},
-        "task": {"control_step": 0.032, "target_radius": 0.05, "arrival": "latch"},
-        "realism": {"name": "ideal", "infrared": "ideal"},
-        "extensions": {},
-        "stages": [{"name": "mine", "robots": 2, "side": 1.0}],
-        "config": {},
-        "versions": {},
-        "update": 17,
-        "seed": 0,
-    }
+    policy_file.write(path, floats, baselines.meta(learners, "tanh"))
 
 
 # Kinds of damage: each function takes the content of a file and returns the damaged content

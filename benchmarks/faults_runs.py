@@ -282,51 +282,48 @@ def _digest_of(run: Path, step: int) -> str:
     return digest(checkpoint.find(run, step).leaves)
 
 
-def _newest(run: Path, random: np.random.Generator) -> list[Path]:
-    """Returns the folders of the newest checkpoints: one, two or three of them."""
+Damage = Callable[[Path, np.random.Generator], object]
+
+
+def _newest(damage: Damage, run: Path, random: np.random.Generator) -> set[int]:
+    """Damages the folders of the newest checkpoints: one, two or three of them."""
     steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
-    return [run / checkpoint.FOLDER / str(step) for step in steps]
+    for step in steps:
+        damage(run / checkpoint.FOLDER / str(step), random)
+    return set(steps)
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def _flip(run: Path, random: np.random.Generator) -> set[int]:
-    """Flips one bit in one file of each of the newest checkpoints."""
-    for step in (chosen := _newest(run, random)):
-        file = _files(step)[random.integers(len(_files(step)))]
-        content = bytearray(file.read_bytes())
-        if content:
-            content[random.integers(len(content))] ^= 1 << int(random.integers(8))
-        file.write_bytes(content)
-    return _numbers(chosen)
+def _flip(folder: Path, random: np.random.Generator) -> None:
+    """Flips one bit in one file."""
+    file = _files(folder)[random.integers(len(_files(folder)))]
+    content = bytearray(file.read_bytes())
+    if content:
+        content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+    file.write_bytes(content)
 
 
-def _cut(run: Path, random: np.random.Generator) -> set[int]:
-    """Truncates one file of each of the newest checkpoints."""
-    for step in (chosen := _newest(run, random)):
-        file = _files(step)[random.integers(len(_files(step)))]
-        content = file.read_bytes()
-        file.write_bytes(content[: random.integers(len(content) + 1)])
-    return _numbers(chosen)
+def _cut(folder: Path, random: np.random.Generator) -> None:
+    """Truncates one file."""
+    file = _files(folder)[random.integers(len(_files(folder)))]
+    content = file.read_bytes()
+    file.write_bytes(content[: random.integers(len(content) + 1)])
 
 
-def _delete(run: Path, random: np.random.Generator) -> set[int]:
-    """Deletes some files of each of the newest checkpoints."""
-    for step in (chosen := _newest(run, random)):
-        for file in _files(step):
-            if random.random() < 0.3:
-                file.unlink()
-    return _numbers(chosen)
+def _delete(folder: Path, random: np.random.Generator) -> None:
+    """Deletes some files."""
+    for file in _files(folder):
+        if random.random() < 0.3:
+            file.unlink()
 
 
-def _empty(run: Path, random: np.random.Generator) -> set[int]:
-    """Empties the folder of each of the newest checkpoints."""
-    for step in (chosen := _newest(run, random)):
-        shutil.rmtree(step)
-        step.mkdir()
-    return _numbers(chosen)
+def _empty(folder: Path, _: np.random.Generator) -> None:
+    """Empties a folder."""
+    shutil.rmtree(folder)
+    folder.mkdir()
 
 
 def _swap(run: Path, random: np.random.Generator) -> set[int]:
@@ -377,15 +374,11 @@ def _config(run: Path, _: np.random.Generator) -> set[int]:
     return set(checkpoint.steps(run))
 
 
-def _numbers(folders: list[Path]) -> set[int]:
-    return {int(folder.name) for folder in folders}
-
-
 _DAMAGES: dict[str, Callable[[Path, np.random.Generator], set[int]]] = {
-    "flip": _flip,
-    "cut": _cut,
-    "delete": _delete,
-    "empty": _empty,
+    "flip": functools.partial(_newest, _flip),
+    "cut": functools.partial(_newest, _cut),
+    "delete": functools.partial(_newest, _delete),
+    "empty": functools.partial(_newest, _empty),
     "swap": _swap,
     "rename": _rename,
     "twin": functools.partial(_foreign, "twin"),

@@ -57,27 +57,13 @@ _SMALL = {
 _KEYS = [
     *("extensions", "resume", "init_from", "recipe", "run.dir", "run.coordinator", "run.wandb"),
     *("run.compile_cache", "stage", "robot", "algo", "realism", "curriculum.mode", "level", "name"),
-    *(
-        "task.observations",
-        "task.reward.extra",
-        "algo.network",
-        "defaults",
-        "hydra",
-        "cells",
-        "map",
-    ),
+    *("task.observations", "task.reward.extra", "algo.network", "defaults", "hydra"),
+    *("cells", "map"),
     *("side", "body", "max_speed", "sequence", "grid", "seed", "devices", "digest", "<<", "import"),
 ]
 _VALUES = [
-    *(
-        _EVIL,
-        f"./{_EVIL}",
-        f"[{_EVIL}]",
-        "out/../elsewhere",
-        "/etc/hostname",
-        "../mine.yaml",
-        "~/x",
-    ),
+    *(_EVIL, f"./{_EVIL}", f"[{_EVIL}]", "out/../elsewhere", "/etc/hostname"),
+    *("../mine.yaml", "~/x"),
     *("${oc.env:" + _SECRET + "}", f"${_SECRET}", "x/${oc.env:" + _SECRET + "}", "${seed}", "${x}"),
     *("127.0.0.1:9", "http://127.0.0.1:9/a.yaml", "python:evil", "evil:main", "pipe.yaml"),
     *("!!timestamp 2020-01-01", "!!set {a}", "!!binary aGk=", "!!python/name:os.system", "!x y"),

@@ -2,8 +2,7 @@
 
 `python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
 prints one table. `out` writes JSON lines: first a line with versions and commit, then a line for
-each row. `docs` writes the table into DIR/robot.md, between the page's two markers, and writes
-plots into DIR/figures.
+each row. `docs` writes the table into DIR/robot.md, between the page's two markers.
 
 Our numbers are read from the compiled model or from the simulated robot's motion. The benchmark
 writes the reference numbers down a second time, each with its source. If the robot and the
@@ -23,11 +22,11 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import fidelity_body, fidelity_infrared, fidelity_motion, pages, rig
-from benchmarks.fidelity_row import Row
-from benchmarks.rig import Rig
+from benchmarks import fidelity_infrared, fidelity_motion, lines
+from benchmarks import fidelity_rig as rig
+from benchmarks.fidelity_rig import Rig, Row
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, Section, about, build, files
+from swarmjax.config import ConfigError, Section, about
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.task.stage_files import load_levels
 
@@ -43,14 +42,7 @@ class FidelityConfig(Section):
     """Settings: where to write the table, in addition to the terminal."""
 
     out: str | None = field(default=None, metadata=about("file of JSON lines"))
-    docs: str | None = field(
-        default=None, metadata=about(f"folder of {PAGE}, for the table and the plots")
-    )
-
-
-def load(arguments: Sequence[str]) -> FidelityConfig:
-    """Makes the settings from `key=value` words; raises ConfigError if a word is invalid."""
-    return build(FidelityConfig, files.nest(files.parse(FidelityConfig, arguments)))
+    docs: str | None = field(default=None, metadata=about(f"folder of {PAGE}, for the table"))
 
 
 def rigs() -> list[Rig]:
@@ -70,7 +62,7 @@ def measure(benches: Sequence[Rig]) -> list[Row]:
     """
     planar, wheeled, planar_v2, wheeled_v2 = benches
     return [
-        *fidelity_body.rows(planar, wheeled, planar_v2, wheeled_v2),
+        *rig.rows(planar, wheeled, planar_v2, wheeled_v2),
         *fidelity_motion.rows(planar, wheeled, planar_v2, wheeled_v2),
         *fidelity_infrared.rows(planar, wheeled),
     ]
@@ -127,54 +119,72 @@ def print_table(rows: Sequence[Row], console: Console) -> None:
 
 def markdown(rows: Sequence[Row]) -> str:
     """Returns the table for the documentation, with a heading per section."""
-    lines = []
+    found = []
     for section, members in _sections(rows):
-        lines += [f"### {section}", "", f"| {' | '.join(HEADS)} |", "|---|---|--:|---|--:|--:|--:|"]
-        lines += [f"| {' | '.join(_cells(row))} |" for row in members]
-        lines.append("")
-    return "\n".join(lines)
+        found += [f"### {section}", "", f"| {' | '.join(HEADS)} |", "|---|---|--:|---|--:|--:|--:|"]
+        found += [f"| {' | '.join(_cells(row))} |" for row in members]
+        found.append("")
+    return "\n".join(found)
 
 
-def write_docs(folder: Path, rows: Sequence[Row], benches: Sequence[Rig]) -> None:
-    """Writes the table into the page, and the plots next to it.
+def insert(text: str, page: str, marker: str, part: str) -> str:
+    """Puts text between the markers `<!-- marker -->` and `<!-- /marker -->` of a page.
+
+    Args:
+      text: text of the whole page.
+      page: name of the page, for error messages.
+      marker: the word inside both markers.
+      part: text to put between the markers.
+
+    Returns:
+      The new text of the page.
+
+    Raises:
+      ConfigError: if a marker is missing, or the end marker comes before the begin marker.
+    """
+    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
+    before, begun, rest = text.partition(begin)
+    _, ended, after = rest.partition(end)
+    if not (begun and ended):
+        raise ConfigError(f"{page} has no place for the table: give it {begin} and {end}.")
+    return f"{before}{begin}\n\n{part}\n{end}{after}"
+
+
+def write_docs(folder: Path, rows: Sequence[Row]) -> None:
+    """Writes the table into the page.
 
     Args:
       folder: folder of the page.
       rows: rows of the table.
-      benches: rigs for the plots, from `rigs`.
 
     Raises:
       ConfigError: if the page is missing, or has no place for the table.
     """
-    # Imported only here, since only the developers' tools include Matplotlib.
-    from benchmarks import fidelity_figures
-
     path = folder / PAGE
     try:
-        path.write_text(pages.insert(path.read_text(), PAGE, MARKER, markdown(rows)))
-        fidelity_figures.draw(folder / "figures", benches[0], benches[1])
+        path.write_text(insert(path.read_text(), PAGE, MARKER, markdown(rows)))
     except OSError as error:
         raise ConfigError(f"docs is {folder}, which cannot be used: {error.strerror}.") from None
 
 
 def write_lines(path: Path, rows: Sequence[Row]) -> None:
     """Writes the JSON lines; raises ConfigError if the file cannot be written."""
-    lines = [head(), *(row.line() for row in rows)]
+    content = [head(), *(row.line() for row in rows)]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("".join(json.dumps(line, allow_nan=False) + "\n" for line in lines))
+        path.write_text("".join(json.dumps(line, allow_nan=False) + "\n" for line in content))
     except OSError as error:
         raise ConfigError(f"out is {path}, which cannot be written: {error.strerror}.") from None
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings, benches = load(arguments), rigs()
-    rows = measure(benches)
+    settings = lines.load(FidelityConfig, arguments)
+    rows = measure(rigs())
     if settings.out is not None:
         write_lines(Path(settings.out), rows)
     if settings.docs is not None:
-        write_docs(Path(settings.docs), rows, benches)
+        write_docs(Path(settings.docs), rows)
     print_table(rows, Console())
     return 0
 

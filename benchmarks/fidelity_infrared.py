@@ -7,10 +7,18 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from benchmarks import rig
-from benchmarks.fidelity_body import cast
-from benchmarks.fidelity_row import ARGOS, CLOSED, MEASURED, SENSOR, XPUCK, Row, beside
-from benchmarks.rig import Rig
+from benchmarks import fidelity_rig as rig
+from benchmarks.fidelity_rig import (
+    ARGOS,
+    CLOSED,
+    MEASURED,
+    SENSOR,
+    XPUCK,
+    Rig,
+    Row,
+    beside,
+    cast,
+)
 from swarmjax import epuck
 from swarmjax.sim import infrared, noise, response
 from swarmjax.sim.infrared import Reflectance

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from benchmarks import rig
-from benchmarks.fidelity_body import BODY, contact_radius
-from benchmarks.fidelity_row import (
+from benchmarks import fidelity_rig as rig
+from benchmarks.fidelity_rig import (
     ARGOS,
+    BODY,
     CLOSED,
     ENKI,
     FIRMWARE,
@@ -22,10 +22,12 @@ from benchmarks.fidelity_row import (
     ROS,
     TOFFI,
     XPUCK,
+    Rig,
     Row,
+    Track,
     beside,
+    contact_radius,
 )
-from benchmarks.rig import Rig, Track
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.sim import motor
 from swarmjax.sim.wheeled import encoders

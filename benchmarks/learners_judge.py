@@ -11,10 +11,7 @@ from numpy.typing import ArrayLike
 
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_mjx, judge
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import networks
-from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import level, placement
@@ -96,7 +93,7 @@ def _make_room(drawn: Level, spacing: Spacing) -> Level:
 
 def outcomes(
     world: World,
-    config: AlgoConfig,
+    ppo: PPO,
     learners: LearnerState,
     levels: Level,
     steps: int,
@@ -105,14 +102,14 @@ def outcomes(
 ) -> Outcomes:
     """Runs an episode of each level with policies in training.
 
-    The function is pure: `jit` it with `world`, `config` and `steps` bound, and `vmap` it over the
+    The function is pure: `jit` it with `world`, `ppo` and `steps` bound, and `vmap` it over the
     seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
     together (E, or E times the number of seeds), because MJX-Warp sizes its memory of contacts for
     that number. The world's `task.step_limit` is ignored.
 
     Args:
       world: the compiled environment.
-      config: the config that made the learners.
+      ppo: what made the learners.
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
@@ -122,32 +119,26 @@ def outcomes(
       [E] outcomes. If the physics of an episode breaks, the episode ends at that step, and its
       robots stay where they were before the step.
     """
-    act = partial(_choose, config, learners, sampled=sampled)
-    memory = networks.begin_memory(config, levels.present.shape)
-    first = None if memory is None else memory.actor
+    act = partial(_choose, ppo, learners, sampled=sampled)
+    first = ppo.begin_memory(levels.present.shape).actor
     arenas, _, broken = engine_mjx.run(world, act, levels, steps, first)
     return _sum_up(arenas, broken, world.task.control_step)
 
 
 def _choose(
-    config: AlgoConfig, learners: LearnerState, memory: Any, arenas: EnvState, *, sampled: bool
+    ppo: PPO, learners: LearnerState, memory: Any, arenas: EnvState, *, sampled: bool
 ) -> tuple[Any, Array]:
     """Returns the learners' actions [E, R, U], drawn as in the judge, or their means."""
     count = len(jax.tree.leaves(learners)[0])
     seen = rollout.to_learners(arenas.observation, count)
-    mine = None if memory is None else rollout.to_learners(memory, count)
+    mine = jax.tree.map(lambda x: rollout.to_learners(x, count), memory)
+    shape = (arenas.observation.shape[-2], ppo.sizes.action)
+    drawn = jnp.zeros((len(arenas.clock), *shape))
     if sampled:
-        actions = learners.params["actor"]["log_std"].shape[-1]
-        shape = (arenas.observation.shape[-2], actions)
         drawn = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
-        action, _, after = jax.vmap(
-            lambda learner, o, n, m: ppo.recall_act(learner, config, o, n, m)
-        )(learners, seen, rollout.to_learners(drawn, count), mine)
-    else:
-        action, after = jax.vmap(lambda learner, o, m: ppo.recall_mode(learner, config, o, m))(
-            learners, seen, mine
-        )
-    return None if after is None else rollout.to_arenas(after), rollout.to_arenas(action)
+    spread = rollout.to_learners(drawn, count)
+    action, _, after = jax.vmap(ppo.act)(learners, seen, spread, mine)
+    return jax.tree.map(rollout.to_arenas, after), rollout.to_arenas(action)
 
 
 def _sum_up(arenas: EnvState, broken: Array, control_step: float) -> Outcomes:

@@ -1,29 +1,54 @@
-"""Provides the settings and result entries that the benchmarks of other projects share.
+"""Measures other projects, with settings equal to ours where possible.
 
-A peer is another project. A peer is installed as an optional extra of this package or from
-`torch-peers.txt`. If a peer is missing, its benchmark prints one line with the reason as `skipped`,
-and exits with code 0.
+`python -m benchmarks.peers who=NAME [key=value ...]` prints the JSON lines of a peer. `vmas`,
+`camar` and `jaxnav` are environments (`benchmarks.peer_environments`). `benchmarl` and
+`jaxmarl_ippo` are trainers with environments of their own (`benchmarks.peer_trainers`). `sb3` and
+`paper_way` train our robots in MuJoCo C (`benchmarks.peer_mujoco_c`). The peer's functions say
+which keys it has and how it is measured.
+
+A peer is installed as an optional extra of this package or from `torch-peers.txt`. If it is
+missing, the command prints one line with the reason as `skipped`, and exits with code 0.
 """
 
 import importlib
 import importlib.metadata
-import json
 import platform
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks import timing
+from benchmarks import lines, timing
 from swarmjax import command, provenance
-from swarmjax.config import Section, about
+from swarmjax.config import ConfigError, Section, about, show
 
 TORCH = "benchmarks/torch-peers.txt"
+# The module of each peer's function, which takes words and yields JSON lines.
+PEERS = {
+    "vmas": "peer_environments",
+    "camar": "peer_environments",
+    "jaxnav": "peer_environments",
+    "benchmarl": "peer_trainers",
+    "jaxmarl_ippo": "peer_trainers",
+    "sb3": "peer_mujoco_c",
+    "paper_way": "peer_mujoco_c",
+}
 
 
 class MissingPeerError(Exception):
     """Raised when a peer is not installed or cannot be imported; the reason is one sentence."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WhoConfig(Section):
+    """Settings: which peer is measured."""
+
+    who: str = field(metadata=about(f"peer: {', '.join(PEERS)}"))
+
+    def _check(self) -> None:
+        if self.who not in PEERS:
+            raise ConfigError(f"who is {show(self.who)}: give one of {', '.join(PEERS)}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,17 +94,10 @@ def run(name: str, main: Callable[[Sequence[str]], int], cls: type[Section]) -> 
         try:
             return main(words)
         except MissingPeerError as error:
-            write([{"benchmark": name, "skipped": str(error)}])
+            lines.write([{"benchmark": name, "skipped": str(error)}])
             return 0
 
     return command.run(name, run_or_skip, cls)
-
-
-def write(lines: Iterator[dict[str, Any]] | Sequence[dict[str, Any]]) -> None:
-    """Prints each JSON line as soon as it is ready."""
-    for line in lines:
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
 
 
 def versions(*packages: str) -> dict[str, str]:
@@ -115,6 +133,62 @@ def speed(
     }
 
 
+def training(
+    robots: int, arenas: int, arena_steps_per_s: float, calls_s: list[float]
+) -> dict[str, Any]:
+    """Returns the entries of a result line that describe a trainer's speed.
+
+    Args:
+      robots: robots per arena, each of which learns from every step.
+      arenas: number of arenas.
+      arena_steps_per_s: control steps of all arenas together, per second.
+      calls_s: seconds of each timed call.
+
+    Returns:
+      Entries with the names in docs/interface.md.
+    """
+    return {
+        "arenas": arenas,
+        "robots": robots,
+        "arena_steps_per_s": arena_steps_per_s,
+        "robot_steps_per_s": arena_steps_per_s * robots,
+        "transitions_per_s": arena_steps_per_s * robots,
+        "compile_s": None,
+        **timing.spread(calls_s),
+    }
+
+
+def timed(
+    call: Callable[[Any, Any], Any], state: Any, argument: Any, repeats: int
+) -> tuple[list[float], dict[str, Any]]:
+    """Compiles and times a program in JAX, as `timing.compile_program` takes it.
+
+    Returns:
+      Seconds of each timed call, and the entries of a result line about the compiled program.
+    """
+    program = timing.compile_program(call, state, argument)
+    calls_s, _ = timing.time_program(program, state, argument, repeats)
+    return calls_s, {"compile_s": program.compile_s, "program_bytes": program.size}
+
+
+def with_jax(*packages: str) -> dict[str, Any]:
+    """Returns the entries that give device, versions and commit of a peer that uses JAX."""
+    return {
+        "matmul_precision": timing.matmul_precision(),
+        **lines.made_with(),
+        "versions": versions(*packages),
+    }
+
+
+def with_torch(torch: Any, device: str, *packages: str) -> dict[str, Any]:
+    """Returns the entries that give device, versions and commit of a peer that uses PyTorch."""
+    return {
+        "device": torch_device_name(torch, device),
+        "versions": versions("torch", *packages),
+        "commit": provenance.commit(),
+    }
+
+
 def torch_device(torch: Any, wanted: str) -> str:
     """Returns the device for PyTorch; `auto` means CUDA if it is available, else the CPU."""
     if wanted != "auto":
@@ -127,3 +201,18 @@ def torch_device_name(torch: Any, device: str) -> str:
     if device == "cuda":
         return f"{torch.cuda.device_count()} x {torch.cuda.get_device_name(0)}"
     return f"CPU {platform.machine()}, {provenance.cores()} cores"
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command; returns its exit code."""
+    chosen, rest = lines.parse(WhoConfig, words)
+    module = importlib.import_module(f"benchmarks.{PEERS[chosen.who]}")
+    lines.write(getattr(module, chosen.who)(rest))
+    return 0
+
+
+if __name__ == "__main__":
+    # The peers' modules raise the error of the imported module, which `__main__` is not.
+    from benchmarks import peers
+
+    sys.exit(peers.run("peers", peers.main, WhoConfig))

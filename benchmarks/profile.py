@@ -11,14 +11,13 @@ and their times are summed over all threads. `busy` is the time of all kernels d
 of the call. `busy` is above 1 if several threads or streams ran at once.
 """
 
-import json
 import operator
 import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,12 +25,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks import steps_per_second
+from benchmarks import lines, steps_per_second
 from swarmjax import command
+from swarmjax.config import Section, about
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 
-TOP = 40
 UPDATES = 2  # number of updates in the traced call of training
 # Kernels run on the threads or streams whose names contain this text, by platform.
 LINES = {"gpu": "Stream", "cpu": "tf_XLA"}
@@ -44,6 +43,13 @@ KINDS = {
     "sort": ("sort", "Sort"),
     "copy": ("memcpy", "Memcpy", "MemcpyD2D", "copy"),
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileConfig(Section):
+    """Settings: what to list."""
+
+    top: int = field(default=40, metadata=about("kernels to list", 1, 10**6))
 
 
 def kind(name: str) -> str:
@@ -87,11 +93,11 @@ def _events(folder: Path) -> Iterator[tuple[str, float]]:
                     )
 
 
-def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) -> list[dict]:
+def rows(given: dict[str, Any], call: Callable[[], Any], steps: int, top: int) -> list[lines.Line]:
     """Profiles a call.
 
     Args:
-      about: entries that every line has.
+      given: entries that every line has.
       call: the function to call, which has run before; it returns arrays.
       steps: control steps per call.
       top: number of kernels to list.
@@ -110,7 +116,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
         "busy": total / seconds,
         "kernels_per_control_step": sum(count.values()) / steps,
         "shares": {name: taken / total for name, taken in _most(by_kind)},
-        **steps_per_second.made_with(),
+        **lines.made_with(),
     }
     each = [
         {
@@ -122,7 +128,7 @@ def lines(about: dict[str, Any], call: Callable[[], Any], steps: int, top: int) 
         }
         for kernel, taken in _most(spent)[:top]
     ]
-    return [about | one for one in (whole, *each)]
+    return [given | one for one in (whole, *each)]
 
 
 def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
@@ -130,11 +136,11 @@ def _most(seconds: dict[str, float]) -> list[tuple[str, float]]:
     return sorted(seconds.items(), key=operator.itemgetter(1), reverse=True)
 
 
-def results(settings: TrainConfig, top: int) -> Iterator[dict]:
+def profile(settings: TrainConfig, top: int) -> Iterator[lines.Line]:
     """Profiles physics, environment and training, and yields their lines."""
     prepared = steps_per_second.prepare(settings)
     schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout_length
-    about = {"arenas": settings.arenas, "robot": settings.robot.body}
+    given = {"arenas": settings.arenas, "robot": settings.robot.body}
     steps = steps_per_second.CONTROL_STEPS[settings.robot.body]
     for name, program, argument, count in (
         ("physics", prepared.physics, keys, steps),
@@ -145,19 +151,17 @@ def results(settings: TrainConfig, top: int) -> Iterator[dict]:
         state = state if name == "training" else state.arenas
         state, _ = program.call(state, argument)
         call = partial(program.call, state, argument)
-        yield from lines({"benchmark": f"profile.{name}", **about}, call, count, top)
+        yield from rows({"benchmark": f"profile.{name}", **given}, call, count, top)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    tops, words = steps_per_second.split(arguments, "top")
-    settings = load_train(["stage=s6", *words])
+    given, words = lines.parse(ProfileConfig, arguments)
+    settings = load_train(["stage=s6", "budget=1e10", *words])
     settings = replace(settings, stage=settings.stage[-1:])
-    for line in results(settings, int(tops[0]) if tops else TOP):
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
+    lines.write(profile(settings, given.top))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(command.run("profile", main, TrainConfig))
+    sys.exit(command.run("profile", main, ProfileConfig))

@@ -3,14 +3,12 @@
 It writes a suite of three cells, `r2`, `r3` and `r4`, named after their numbers of robots. A cell
 has ten draws of starts and targets for each puzzle. For each cell it prints a JSON line with the
 number of levels that can be solved on the grid. `python -m swarmjax.evaluate suite=FILE.npz
-task.arrival=hold policy=...` and `python -m benchmarks.baselines suite=FILE.npz task.arrival=hold`
-read the file.
+task.arrival=hold policy=...` reads the file.
 
 The layouts, the numbers of robots and the number of draws come from POGEMA. The starts and targets
 are drawn by this file.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks import key_value
+from benchmarks import lines
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about, build, files, reading, show
 from swarmjax.evaluate import cells
@@ -29,7 +27,7 @@ from swarmjax.task import level, maps
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig, complete
 
-LAYOUTS = Path(__file__).parent / "maps" / "puzzles.yaml"
+LAYOUTS = Path(__file__).parent / "puzzles.yaml"
 ROBOTS, DRAWS = (2, 3, 4), 10  # from POGEMA's file 05-puzzles.yaml
 # Edge of a cell, m. The edge is less than the 0.148 m that two hulls need side by side. In a bend,
 # two robots can still pass with 6 mm to spare if one robot is in the outer corner. With an edge
@@ -273,17 +271,15 @@ def _stage(rows: Sequence[str], robots: int, edge: float) -> StageConfig:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings = key_value.load(PuzzlesConfig, arguments)
+    settings = lines.load(PuzzlesConfig, arguments)
     puzzles = {robots: draw_puzzles(robots, settings.draws) for robots in settings.robots}
     made = {robots: make_cell(drawn, settings.cell) for robots, drawn in puzzles.items()}
     cells.write(Path(settings.out), Suite("puzzles", tuple(made.values())))
-    for robots, drawn in puzzles.items():
-        sys.stdout.write(json.dumps(_line(made[robots], drawn)) + "\n")
-        sys.stdout.flush()
+    lines.write(_line(made[robots], drawn) for robots, drawn in puzzles.items())
     return 0
 
 
-def _line(cell: Cell, puzzles: Sequence[Draw]) -> dict[str, object]:
+def _line(cell: Cell, puzzles: Sequence[Draw]) -> lines.Line:
     """Makes a cell's JSON line, with its solvable levels and the fewest steps that solve them."""
     steps = [fewest_steps(each) for each in puzzles]
     solved = [each for each in steps if each is not None]

@@ -31,6 +31,7 @@ counts as compiling. Judging is not timed.
 
 import math
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -40,16 +41,19 @@ import jax
 import numpy as np
 from flax import linen
 
-from benchmarks import curriculum, key_value, peers, steps_per_second, timing
-from benchmarks.curriculum_arms import StudyConfig
+from benchmarks import learners_judge, lines, peers, steps_per_second, timing
 from swarmjax import environment
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import optimizer
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
+from swarmjax.run import trainer
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
+from swarmjax.task import env
+from swarmjax.training import mesh
+from swarmjax.training import program as programs
 
 SHARES = (0.90, 0.95)
 # From MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`. Its minibatches
@@ -119,9 +123,14 @@ Judge = Callable[[LearnerState], float]
 
 def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
     """Makes both trainers' judge; it maps learners [N=1, L=1] to the share of targets reached."""
-    study = StudyConfig(levels=race.levels, level_seed=race.level_seed)
-    judge = curriculum.load_judge(study, trained, {"goal": trained.stage[-1]})
-    return lambda learners: float(judge(learners)["goal"]["targets_reached"][0])
+    stage = trained.stage[-1]
+    parts = trained.robot, trained.task, trained.realism, trained.sim
+    world = env.load((stage,), *parts, arenas=race.levels)
+    levels = learners_judge.draw_levels(world, stage, race.level_seed, race.levels)
+    ppo = programs.load_ppo(trained, world)
+    run = partial(learners_judge.outcomes, world, ppo, steps=trained.task.step_limit)
+    call = jax.jit(jax.vmap(run, in_axes=(0, None)))
+    return lambda learners: float(np.mean(call(learners, levels).targets_reached))
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
@@ -136,19 +145,28 @@ def _evenly(race: RaceConfig, updates: int) -> np.ndarray:
 
 def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
     """Trains with swarmjax."""
-    judge = load_judge(race, trained)
-
-    def measured(learners: LearnerState) -> dict[str, dict[str, np.ndarray]]:
-        return {"goal": {"targets_reached": np.array([judge(learners)])}}
-
-    updates = points(race, trained)
-    curves = curriculum.measure(trained, updates, measured)
+    program, schedule = programs.load(trained)
+    state = jax.jit(mesh.init(program))(schedule)
+    compiled = trainer.compile_chunk(program, schedule, state)
+    judge, updates = load_judge(race, trained), points(race, trained)
+    judge(jax.device_get(state.learners))  # compiles, and lets Warp build its kernels
+    seconds, shares, transitions = [], [], []
+    for n in np.diff(updates, prepend=0):
+        began, count = time.perf_counter(), 0
+        for done in range(0, int(n), program.rows):
+            size = min(program.rows, int(n) - done)
+            state, metrics = compiled.call(schedule, state, np.int32(size))
+            count += int(np.asarray(metrics["transitions"])[:, :size].sum(dtype=np.int64))
+        jax.block_until_ready(state)
+        seconds.append(time.perf_counter() - began)
+        transitions.append(count)
+        shares.append(judge(jax.device_get(state.learners)))
     return Course(
-        train_s=np.array(curves.train_s),
-        share=np.array(curves.judged["goal"]["targets_reached"][0]),
-        transitions=np.array(curves.transitions[0]),
+        train_s=np.cumsum(seconds),
+        share=np.array(shares),
+        transitions=np.cumsum(transitions),
         arena_steps=updates * trained.arenas * trained.algo.rollout_length,
-        compile_s=curves.compile_s,
+        compile_s=compiled.seconds,
     )
 
 
@@ -236,7 +254,8 @@ def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
       these learners is newly initialised instead of Brax's critic.
     """
     moments, policy, _ = params
-    mine = ppo.init(jax.random.key(0), trained.algo, moments.mean.shape[-1], 2, 1)
+    sizes = Sizes(moments.mean.shape[-1], 2)
+    mine = PPO.make(trained.algo, sizes, 1).init(jax.random.key(0))
     layers = policy["params"]
     torso = {name: layers["MLP_0"][name] for name in mine.params["actor"]["torso"]}
     actor = {
@@ -321,7 +340,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
         **timing.spread(calls_s.tolist()),
         "levels": race.levels,
         "settings": to_dict(trained.algo) if ours else brax_settings(race, trained),
-        **steps_per_second.made_with(),
+        **lines.made_with(),
         "versions": peers.versions("brax"),
     }
 
@@ -337,7 +356,7 @@ def seconds_to(course: Course) -> dict[str, float | None]:
 
 def parse(words: Sequence[str]) -> tuple[RaceConfig, TrainConfig]:
     """Splits the arguments into those of the race and those of training; raises ConfigError."""
-    race, rest = key_value.parse(RaceConfig, words)
+    race, rest = lines.parse(RaceConfig, words)
     trained = load_train(["stage=s6", *rest])
     _check(race, trained)
     return race, trained
@@ -377,7 +396,7 @@ def main(arguments: Sequence[str]) -> int:
     race, trained = parse(arguments)
     run = {"swarmjax": run_ours, "brax": run_brax}[race.trainer]
     seeded = (replace(trained, seed=seed) for seed in race.seed)
-    peers.write(line(race, each, run(race, each)) for each in seeded)
+    lines.write(line(race, each, run(race, each)) for each in seeded)
     return 0
 
 

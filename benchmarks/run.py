@@ -1,13 +1,10 @@
-"""Runs suites of benchmarks, resumes runs that were cut off, and writes docs/benchmarks.md.
+"""Runs suites of benchmarks, and resumes runs that were cut off.
 
-`python -m benchmarks.run suite=peers out=FILE.jsonl` runs each entry of the suite
-(`benchmarks.suites`) in its own process. It appends each JSON line to `out` as soon as the process
-prints the line, with the entry's name. Measurements that have a result in `out` are not repeated,
-but failed and skipped measurements are repeated. If a process dies, or prints nothing for longer
-than its entry allows, its current measurement is recorded as `failed` and the suite continues.
-
-`python -m benchmarks.run table=FILE.jsonl docs=docs` only writes the tables and plots of that file
-into docs/benchmarks.md. With both `suite` and `docs`, the page is written after the suite has run.
+`python -m benchmarks.run suite=peers out=FILE.jsonl` runs each entry of the suite (`suites.yaml`)
+in its own process. It appends each JSON line to `out` as soon as the process prints the line, with
+the entry's name. Measurements that have a result in `out` are not repeated, but failed and skipped
+measurements are repeated. If a process dies, or prints nothing for longer than its entry allows,
+its current measurement is recorded as `failed` and the suite continues.
 """
 
 import json
@@ -23,49 +20,64 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
-from benchmarks import key_value, run_page
-from benchmarks.suites import SUITES, SuiteEntry
+import yaml
+
+from benchmarks import lines
+from benchmarks.lines import Line, Output
 from swarmjax import command
 from swarmjax.config import ConfigError, Section, about
 
-Line = dict[str, Any]
 _GRACE = 10.0  # s; a process that has not ended by itself after this time is killed
+_LISTED = yaml.safe_load((Path(__file__).parent / "suites.yaml").read_text())
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteEntry:
+    """One benchmark with its settings.
+
+    Attributes:
+      name: name of the entry, which its lines also have.
+      run: the module in benchmarks/ and its `key=value` words.
+      over: key whose several values are measured one by one.
+      values: the values of `over`; each line has one of them.
+      seconds: time limit, s; a process that prints nothing for this long is ended.
+      environment: environment variables of the process.
+    """
+
+    name: str
+    run: str
+    over: str | None = None
+    values: Sequence[int] = ()
+    seconds: float = 300.0
+    environment: dict[str, str] = field(default_factory=dict)
+
+
+ENTRIES = {name: SuiteEntry(name=name, **entry) for name, entry in _LISTED["entries"].items()}
+SUITES = {suite: [ENTRIES[name] for name in names] for suite, names in _LISTED["suites"].items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRunConfig(Section):
     """Settings: what to run, and where the results go."""
 
-    suite: str | None = field(
-        default=None, metadata=about(f"which benchmarks: {', '.join(SUITES)}")
-    )
+    suite: str = field(metadata=about(f"which benchmarks: {', '.join(SUITES)}"))
     only: tuple[str, ...] = field(
         default=(), metadata=about("entries of the suite, by name; []: all of them")
     )
-    out: str | None = field(default=None, metadata=about("file for JSON lines, which are appended"))
+    out: str = field(metadata=about("file for JSON lines, which are appended"))
     minutes: float | None = field(
         default=None, metadata=about("starts no entry after this time; null: no limit", above=0.0)
     )
-    table: str | None = field(
-        default=None, metadata=about("file of JSON lines for the page; null: out")
-    )
-    docs: str | None = field(default=None, metadata=about(f"folder of {run_page.PAGE}"))
 
     def _check(self) -> None:
-        if self.suite is not None and self.suite not in SUITES:
+        if self.suite not in SUITES:
             raise ConfigError(f"suite is '{self.suite}': give one of {', '.join(SUITES)}.")
-        names = [entry.name for entry in SUITES.get(self.suite or "", ())]
+        names = [entry.name for entry in SUITES[self.suite]]
         for name in self.only:
             if name not in names:
                 raise ConfigError(f"only holds '{name}': give any of {', '.join(names)}.")
-        if self.suite is None and (self.table is None or self.docs is None):
-            raise ConfigError("suite is null: give suite=NAME, or table=FILE.jsonl and docs=DIR.")
-        if self.suite is not None and self.out is None:
-            raise ConfigError("out is null: give out=FILE.jsonl for the results of the suite.")
-        if self.table is not None and self.docs is None:
-            raise ConfigError("docs is null: give the folder of the page with table.")
 
 
 # Remaining work
@@ -73,97 +85,45 @@ class SuiteRunConfig(Section):
 
 def entries(config: SuiteRunConfig) -> list[SuiteEntry]:
     """Returns the chosen entries, in the order of their suite."""
-    if config.suite is None:
-        return []
     return [entry for entry in SUITES[config.suite] if entry.name in config.only or not config.only]
 
 
-def left(entry: SuiteEntry, lines: Sequence[Line]) -> list[str | None]:
+def left(entry: SuiteEntry, done: Sequence[Line]) -> list[int | None]:
     """Returns the values of an entry that have no result yet.
 
     Args:
       entry: entry of a suite.
-      lines: lines of `out`.
+      done: lines of `out`.
 
     Returns:
       The values that are missing, or that failed or were skipped when last tried. An entry without
       values counts as one value, None.
     """
     values = entry.values or (None,)
-    return [value for value in values if not _is_done(entry, value, lines)]
+    return [value for value in values if not _is_done(entry, value, done)]
 
 
-def _is_done(entry: SuiteEntry, value: str | None, lines: Sequence[Line]) -> bool:
+def _is_done(entry: SuiteEntry, value: int | None, done: Sequence[Line]) -> bool:
     """Tells whether the newest line of an entry and value is a result."""
-    mine = [line for line in lines if _is_of(entry, value, line)]
+    mine = [line for line in done if _is_of(entry, value, line)]
     return bool(mine) and not {"failed", "skipped"} & mine[-1].keys()
 
 
-def _is_of(entry: SuiteEntry, value: str | None, line: Line) -> bool:
+def _is_of(entry: SuiteEntry, value: int | None, line: Line) -> bool:
     if line.get("entry") != entry.name:
         return False
-    return entry.over is None or str(line.get(entry.over)) == value
+    return entry.over is None or line.get(entry.over) == value
 
 
-def command_line(entry: SuiteEntry, values: Sequence[str | None]) -> list[str]:
+def command_line(entry: SuiteEntry, values: Sequence[int | None]) -> list[str]:
     """Returns the command of a process that measures some values of an entry."""
-    words = [*entry.words]
+    module, *words = entry.run.split()
     if entry.over is not None:
         words.append(f"{entry.over}={','.join(str(value) for value in values)}")
-    return [sys.executable, "-m", f"benchmarks.{entry.module}", *words]
+    return [sys.executable, "-m", f"benchmarks.{module}", *words]
 
 
 # Running
-
-
-class Output:
-    """The file to which a suite appends its JSON lines."""
-
-    def __init__(self, path: Path) -> None:
-        """Reads the existing lines.
-
-        Raises:
-          ConfigError: if the file cannot be read or written.
-        """
-        self.lines, self._path = read(path) if path.exists() else [], path
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.touch()
-        except OSError as error:
-            raise ConfigError(
-                f"out is {path}, which cannot be written: {error.strerror}."
-            ) from None
-
-    def add(self, line: Line) -> None:
-        """Appends a line to the file immediately."""
-        self.lines.append(line)
-        with self._path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-
-
-def read(path: Path) -> list[Line]:
-    """Reads JSON lines.
-
-    Args:
-      path: path of the file; a last line that was cut off is skipped.
-
-    Returns:
-      The lines.
-
-    Raises:
-      ConfigError: if the file cannot be read, or a line is not JSON.
-    """
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}.") from None
-    found = []
-    for number, line in enumerate(text.split("\n")[:-1], 1):
-        try:
-            found.append(json.loads(line))
-        except ValueError:
-            raise ConfigError(f"{path} in line {number} is not JSON: remove it.") from None
-    return found
 
 
 def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
@@ -180,23 +140,21 @@ def run_entry(entry: SuiteEntry, output: Output, deadline: float) -> None:
     """
     waiting = left(entry, output.lines)
     while waiting:
-        values = waiting[: entry.each or len(waiting)]
-        rest = waiting[len(values) :]
-        process, first = Process(entry, values), len(output.lines)
+        process, first = Process(entry, waiting), len(output.lines)
         for line in process.lines(deadline):
             output.add({**line, "entry": entry.name})
         new = output.lines[first:]
         if process.late or any("skipped" in line for line in new):
             return
-        untried = [value for value in values if not any(_is_of(entry, value, x) for x in new)]
+        untried = [value for value in waiting if not any(_is_of(entry, value, x) for x in new)]
         if untried:
             output.add(_failed(entry, untried[0], process.reason))
-        waiting = [*untried[1:], *rest]
+        waiting = untried[1:]
 
 
-def _failed(entry: SuiteEntry, value: str | None, reason: str) -> Line:
+def _failed(entry: SuiteEntry, value: int | None, reason: str) -> Line:
     """Makes the JSON line that records a value as failed."""
-    line = {"benchmark": entry.module, "entry": entry.name, "failed": reason}
+    line = {"benchmark": entry.run.split()[0], "entry": entry.name, "failed": reason}
     return line if entry.over is None else {**line, entry.over: value}
 
 
@@ -208,7 +166,7 @@ class Process:
       late: whether the process was ended because the time of the whole run was up.
     """
 
-    def __init__(self, entry: SuiteEntry, values: Sequence[str | None]) -> None:
+    def __init__(self, entry: SuiteEntry, values: Sequence[int | None]) -> None:
         """Starts the process."""
         self.reason, self.late, self._closed = "", False, False
         self._limit = entry.seconds
@@ -287,7 +245,7 @@ def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
       config: which entries to run, and for how long.
       say: the stream for a report on each entry.
     """
-    output = Output(Path(config.out or ""))
+    output = Output(Path(config.out))
     deadline = math.inf if config.minutes is None else time.monotonic() + 60.0 * config.minutes
     for entry in entries(config):
         began, first = time.monotonic(), len(output.lines)
@@ -308,12 +266,7 @@ def run_suite(config: SuiteRunConfig, say: TextIO) -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    config = key_value.load(SuiteRunConfig, arguments)
-    if config.suite is not None:
-        run_suite(config, sys.stderr)
-    if config.docs is not None:
-        source = Path(config.table or config.out or "")
-        run_page.write(Path(config.docs), read(source), source)
+    run_suite(lines.load(SuiteRunConfig, arguments), sys.stderr)
     return 0
 
 

@@ -14,7 +14,6 @@ in the last call. Speeds are totals over all `seeds`. If a device runs out of me
 the reason as `failed`.
 """
 
-import json
 import statistics
 import sys
 from collections.abc import Iterator, Sequence
@@ -28,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from benchmarks import timing
-from swarmjax import command, provenance
+from benchmarks import lines, timing
+from swarmjax import command
 from swarmjax.curriculum.engine import Next, Schedule
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -184,7 +183,7 @@ def _line(
         "compile_s": compiled.compile_s,
         "program_bytes": compiled.size,
         **timing.spread(calls_s),
-        **made_with(),
+        **lines.made_with(),
     }
 
 
@@ -212,15 +211,6 @@ def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
         "control_step": settings.task.control_step,
         **COUNTED,
         "matmul_precision": timing.matmul_precision(),
-    }
-
-
-def made_with() -> dict[str, Any]:
-    """Returns the entries of a result line that give the device, versions and commit."""
-    return {
-        "device": provenance.device(),
-        "versions": provenance.versions(),
-        "commit": provenance.commit(),
     }
 
 
@@ -301,7 +291,7 @@ def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
         except jax.errors.JaxRuntimeError as error:
             reason = str(error).partition("\n")[0][:300]
             line = {"benchmark": "steps_per_second", **about(settings), "failed": reason}
-            yield [line | made_with()]
+            yield [line | lines.made_with()]
 
 
 def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState, Array]:
@@ -318,29 +308,16 @@ def _environments(
     return seeds.each(program.config, lambda lane: step(*lane), (arenas, keys))
 
 
-def split(words: Sequence[str], key: str) -> tuple[list[str], list[str]]:
-    """Separates a key with several values from the other arguments of a command line.
-
-    Args:
-      words: `key=value` arguments.
-      key: the key; commas separate its values.
-
-    Returns:
-      The list of the key's values, which is empty if the key is missing, and the other arguments.
-    """
-    given = [word.partition("=")[2] for word in words if word.startswith(f"{key}=")]
-    rest = [word for word in words if not word.startswith(f"{key}=")]
-    return given[-1].split(",") if given else [], rest
-
-
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    sizes, words = split(arguments, "arenas")
-    given = [[f"arenas={size}"] for size in sizes] or [[]]
-    points = [load_train(["stage=s6", *words, *size]) for size in given]
-    for lines in sweep([replace(point, stage=point.stage[-1:]) for point in points]):
-        sys.stdout.write("".join(json.dumps(line) + "\n" for line in lines))
-        sys.stdout.flush()
+    sizes = [word.partition("=")[2] for word in arguments if word.startswith("arenas=")]
+    words = ["stage=s6", *arguments]
+    points = [
+        load_train([*words, f"arenas={size}"] if sizes else words)
+        for size in (sizes[-1].split(",") if sizes else [""])
+    ]
+    for measured in sweep([replace(point, stage=point.stage[-1:]) for point in points]):
+        lines.write(measured)
     return 0
 
 

@@ -81,11 +81,15 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
         part of an extension does not fit.
     """
     world = load_world(config)
-    return Program(config, world, _load_ppo(config, world), by_robot), schedule(config)
+    return Program(config, world, load_ppo(config, world), by_robot), schedule(config)
 
 
-def _load_ppo(config: ProgramConfig, world: World) -> PPO:
-    """Builds PPO for the observations and actions of an environment."""
+def load_ppo(config: ProgramConfig, world: World) -> PPO:
+    """Builds PPO for the observations and actions of an environment.
+
+    Raises:
+      ConfigError: the network of an extension or the gradient's backend does not fit.
+    """
     size, heard = world.observation_size, config.task.neighbours
     first = size - heard.count * heard.width
     sizes = Sizes(

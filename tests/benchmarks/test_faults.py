@@ -60,7 +60,7 @@ def test_the_table_counts_outcomes(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_a_campaign_that_does_not_exist_is_refused() -> None:
-    sentence = refusal(faults.parse, ["campaign=floods", "out=a"])
+    sentence = refusal(faults.main, ["campaign=floods", "out=a"])
     assert sentence.startswith("campaign is 'floods': give one of kills, terms, ")
 
 

@@ -103,3 +103,19 @@ def test_seconds_to_a_share() -> None:
         compile_s=0.0,
     )
     assert race.seconds_to(course) == {"seconds_to_0.90": 2.0, "seconds_to_0.95": None}
+
+
+def test_our_course_has_a_point_for_each_judgement(
+    tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The stand-in for the judge returns how many transitions the normaliser has seen."""
+    monkeypatch.setattr(
+        race, "load_judge", lambda *_: lambda learners: float(learners.normalizer.count[0, 0])
+    )
+    asked = race.RaceConfig(points=4)
+    course = race.run_ours(asked, tiny_config)
+    np.testing.assert_array_equal(course.share, course.transitions)
+    # 20 updates in 4 parts, each of 8 arenas with 8 control steps.
+    np.testing.assert_array_equal(course.arena_steps, [320, 640, 960, 1280])
+    assert (np.diff(course.train_s, prepend=0.0) > 0.0).all()
+    assert course.transitions[-1] <= 3 * course.arena_steps[-1]

@@ -13,10 +13,9 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import dispatch
-from swarmjax.ppo import networks
-from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo import dispatch, networks
 from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Hearing, Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
 

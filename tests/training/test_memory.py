@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from swarmjax.ppo.learner import Batch, LearnerState
 
 from swarmjax.ppo import learner as ppo
 from swarmjax.ppo import losses, networks
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import observation

@@ -1,22 +1,30 @@
-"""How fast does JaxMARL's IPPO train on JaxNav, with rollout and update in one program?
+"""How fast do other projects train robots on environments of their own?
 
-`python -m benchmarks.peer_jaxmarl_ippo [arenas=4096,16384] ...` needs the extra `jaxmarl` and
-prints a JSON line for each number of arenas.
+`python -m benchmarks.peers who=benchmarl|jaxmarl_ippo [arenas=4096] [key=value ...]` prints a JSON
+line for each number of arenas. The networks, the rollout length and the numbers of epochs and
+minibatches are those of swarmjax, so batches have the same size.
 
-JaxMARL's scripts are not in its package and have no configuration for JaxNav. This file is a
-rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers of 64, one
-policy for all robots, a clipped value loss, advantages normalised in each minibatch, and samples
-shuffled individually. The learning rate, the costs and the clip range come from that script's
-configuration. The rollout length and the numbers of epochs and minibatches are those of swarmjax,
-so batches have the same size. Episodes start from a pool of states that were drawn beforehand, as
-in the best case of `benchmarks.peer_jaxnav`.
+- `benchmarl` trains VMAS's navigation scenario with BenchMARL's IPPO, which uses PyTorch
+  (`torch-peers.txt`). All other settings are BenchMARL's defaults. The line has the seconds of all
+  iterations except the first two. An iteration collects a rollout and learns from it, without
+  logging or evaluation.
+- `jaxmarl_ippo` trains JaxNav with JaxMARL's IPPO (the extra `jaxmarl`), with rollout and update in
+  one program. JaxMARL's scripts are not in its package and have no configuration for JaxNav. This
+  file is a rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers
+  of 64, one policy for all robots, a clipped value loss, advantages normalised in each minibatch,
+  and samples shuffled individually. The learning rate, the costs and the clip range come from that
+  script's configuration. Episodes start from a pool of states, as in the best case of `jaxnav`.
 """
 
+import contextlib
+import itertools
 import sys
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +33,12 @@ import optax
 from flax import linen as nn
 from jax import Array
 
-from benchmarks import key_value, peer_jaxnav, peers, timing
+from benchmarks import lines, peer_environments, peers, timing
+from benchmarks.lines import Line
 from benchmarks.peers import PeerConfig
-from swarmjax import provenance
 from swarmjax.config import about, to_dict
 
+_WARM = 2  # warm-up iterations of BenchMARL
 ACTION_SIZE = 2
 # baselines/IPPO/config/ippo_ff_mabrax.yaml
 LEARNING_RATE, DISCOUNT, GAE_LAMBDA, CLIP = 1e-3, 0.99, 0.95, 0.2
@@ -39,14 +48,135 @@ Pool = tuple[Any, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class IppoConfig(PeerConfig):
-    """Settings for measuring JaxMARL's trainer; `steps` is not used."""
+class TrainerConfig(PeerConfig):
+    """Settings for measuring a trainer; `steps` is not used."""
 
     rollout: int = field(default=32, metadata=about("control steps per update", 1, 10**4))
     epochs: int = field(default=4, metadata=about("passes over a rollout", 1, 100))
     minibatches: int = field(default=8, metadata=about("gradient steps per pass", 1, 1000))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarlConfig(TrainerConfig):
+    """Settings for measuring BenchMARL."""
+
+    device: Literal["auto", "cuda", "cpu"] = field(
+        default="auto", metadata=about("device of PyTorch; auto: cuda if there is one")
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class IppoConfig(TrainerConfig):
+    """Settings for measuring JaxMARL's trainer."""
+
     updates: int = field(default=4, metadata=about("updates per call", 1, 1000))
     pool: int = field(default=1024, metadata=about("number of start states in the pool", 1, 2**20))
+
+
+# BenchMARL
+
+
+def experiment(
+    config: BenchmarlConfig, arenas: int, device: str, folder: str, callback: Any
+) -> Any:
+    """Makes BenchMARL's experiment.
+
+    Args:
+      config: the settings.
+      arenas: number of arenas.
+      device: device of PyTorch.
+      folder: folder for the files that BenchMARL always writes.
+      callback: a BenchMARL callback.
+
+    Returns:
+      The experiment, ready to run.
+    """
+    algorithms = peers.find("benchmarl.algorithms", peers.TORCH)
+    environments = peers.find("benchmarl.environments", peers.TORCH)
+    experiments = peers.find("benchmarl.experiment", peers.TORCH)
+    models = peers.find("benchmarl.models.mlp", peers.TORCH)
+    torch = peers.find("torch", peers.TORCH)
+    task = environments.VmasTask.NAVIGATION.get_from_yaml()
+    task.config |= {
+        key: value
+        for key, value in peer_environments.vmas_task(config).items()
+        if key not in ("scenario", "continuous_actions")
+    }
+    model = models.MlpConfig(
+        num_cells=[64, 64], activation_class=torch.nn.Tanh, layer_class=torch.nn.Linear
+    )
+    chosen = experiments.ExperimentConfig.get_from_yaml()
+    for name, value in changes(config, arenas, device, folder).items():
+        setattr(chosen, name, value)
+    return experiments.Experiment(
+        task=task,
+        algorithm_config=algorithms.IppoConfig.get_from_yaml(),
+        model_config=model,
+        critic_model_config=model,
+        seed=config.seed,
+        config=chosen,
+        callbacks=[callback],
+    )
+
+
+def changes(config: BenchmarlConfig, arenas: int, device: str, folder: str) -> dict[str, Any]:
+    """Returns our changes to BenchMARL's defaults: batch, device, no files and no evaluation."""
+    frames = arenas * config.rollout
+    return {
+        "sampling_device": device,
+        "train_device": device,
+        "buffer_device": device,
+        "on_policy_n_envs_per_worker": arenas,
+        "on_policy_collected_frames_per_batch": frames,
+        "on_policy_n_minibatch_iters": config.epochs,
+        "on_policy_minibatch_size": frames // config.minibatches,
+        "max_n_frames": None,
+        "max_n_iters": _WARM + config.repeats,
+        "evaluation": False,
+        "render": False,
+        "loggers": [],
+        "create_json": False,
+        "checkpoint_interval": 0,
+        "checkpoint_at_end": False,
+        "save_folder": folder,
+    }
+
+
+def clock(torch: Any, ends: list[float]) -> Any:
+    """Makes a callback that appends the time at the end of each iteration's learning to `ends`."""
+
+    def note(self: Any, training_td: Any, group: str) -> None:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        ends.append(time.perf_counter())
+
+    base = peers.find("benchmarl.experiment.callback", peers.TORCH).Callback
+    # BenchMARL pickles its callbacks, and cannot find a class defined in a function.
+    members = {"on_train_end": note, "__reduce__": lambda self: (object, ())}
+    return type("Clock", (base,), members)()
+
+
+def benchmarl(words: Sequence[str]) -> Iterator[Line]:
+    """Trains with BenchMARL; yields a JSON line for each number of arenas."""
+    config = lines.load(BenchmarlConfig, words)
+    torch = peers.find("torch", peers.TORCH)
+    device = peers.torch_device(torch, config.device)
+    for arenas in config.arenas:
+        ends: list[float] = []
+        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
+            experiment(config, arenas, device, folder, clock(torch, ends)).run()
+        calls_s = [after - before for before, after in itertools.pairwise(ends[_WARM - 1 :])]
+        rate = config.rollout * arenas / timing.spread(calls_s)["call_s"]
+        yield {
+            "benchmark": "peer_benchmarl",
+            "trainer": "BenchMARL IPPO, VMAS navigation",
+            **peers.training(config.robots, arenas, rate, calls_s),
+            "settings": to_dict(config) | {"task": peer_environments.vmas_task(config)},
+            **peers.with_torch(torch, device, "vmas", "benchmarl", "torchrl", "tensordict"),
+        }
+
+
+# JaxMARL
 
 
 class ActorCritic(nn.Module):
@@ -113,7 +243,7 @@ def load(world: Any, config: IppoConfig, arenas: int) -> Ippo:
 def init(ippo: Ippo, pool: Pool) -> Carry:
     """Starts networks and arenas."""
     key, network_key = jax.random.split(jax.random.key(ippo.config.seed))
-    seen, states = peer_jaxnav.begin(pool, ippo.arenas)
+    seen, states = peer_environments.begin(pool, ippo.arenas)
     flat = _flat(ippo, seen)
     params = ippo.network.init(network_key, flat[:1])
     return Carry(params, ippo.optimizer.init(params), states, flat, key)
@@ -140,7 +270,7 @@ def _step(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Transit
     robots = len(ippo.world.agents)
     by_robot = dict(zip(ippo.world.agents, action.reshape(robots, -1, ACTION_SIZE), strict=True))
     keys = jax.random.split(step_key, ippo.arenas)
-    seen, states, reward, done, _ = peer_jaxnav.step(
+    seen, states, reward, done, _ = peer_environments.step(
         ippo.world, "pool", pool, keys, carry.states, by_robot
     )
     transition = Transition(
@@ -216,10 +346,11 @@ def update(ippo: Ippo, pool: Pool, carry: Carry, _: None) -> tuple[Carry, Array]
     return carry._replace(params=params, optimizer=state, key=key), jnp.mean(losses)
 
 
-def results(config: IppoConfig) -> Iterator[dict[str, Any]]:
-    """Trains with each number of arenas, and yields a JSON line for each number."""
-    world = peer_jaxnav.make(config)
-    pool = peer_jaxnav.draw_pool(world, config.pool, config.seed)
+def jaxmarl_ippo(words: Sequence[str]) -> Iterator[Line]:
+    """Trains with JaxMARL's IPPO; yields a JSON line for each number of arenas."""
+    config = lines.load(IppoConfig, words)
+    world = peer_environments.make_jaxnav(config)
+    pool = peer_environments.draw_pool(world, config.pool, config.seed)
     for arenas in config.arenas:
         ippo = load(world, config, arenas)
 
@@ -227,34 +358,14 @@ def results(config: IppoConfig) -> Iterator[dict[str, Any]]:
             return jax.lax.scan(partial(update, ippo, pool), carry, length=config.updates)
 
         carry = jax.jit(partial(init, ippo))(pool)
-        program = timing.compile_program(train, carry, pool)
-        calls_s, _ = timing.time_program(program, carry, pool, config.repeats)
+        calls_s, compiled = peers.timed(train, carry, pool, config.repeats)
         rate = config.updates * config.rollout * arenas / timing.spread(calls_s)["call_s"]
         yield {
             "benchmark": "peer_jaxmarl_ippo",
             "trainer": "JaxMARL IPPO, JaxNav",
-            "arenas": arenas,
-            "robots": config.robots,
-            "arena_steps_per_s": rate,
-            "robot_steps_per_s": rate * config.robots,
-            "transitions_per_s": rate * config.robots,
-            "compile_s": program.compile_s,
-            "program_bytes": program.size,
-            **timing.spread(calls_s),
-            "resets": peer_jaxnav.RESETS["pool"],
-            "matmul_precision": timing.matmul_precision(),
-            "settings": to_dict(config) | {"task": peer_jaxnav.task(config)},
-            "device": provenance.device(),
-            "versions": peers.versions("jaxmarl"),
-            "commit": provenance.commit(),
+            **peers.training(config.robots, arenas, rate, calls_s),
+            **compiled,
+            "resets": peer_environments.RESETS["pool"],
+            "settings": to_dict(config) | {"task": peer_environments.jaxnav_task(config)},
+            **peers.with_jax("jaxmarl"),
         }
-
-
-def main(arguments: Sequence[str]) -> int:
-    """Runs the command; returns its exit code."""
-    peers.write(results(key_value.load(IppoConfig, arguments)))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(peers.run("peer_jaxmarl_ippo", main, IppoConfig))

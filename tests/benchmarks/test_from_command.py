@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from sentences import refusal
 
-from benchmarks import command_to_success
-from benchmarks.watched_run import Watched
+from benchmarks import from_command
+from benchmarks.from_command import Watched
 from swarmjax.config import ConfigError
 
 # The script writes a row of metrics for each success, and exits on SIGINT.
@@ -40,7 +40,7 @@ def test_a_run_is_stopped_where_it_reaches_its_targets(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _put(tmp_path, monkeypatch, [None, 0.5, 0.91, 0.93, 0.97])
-    found, row = command_to_success.train([], tmp_path / "run", 0.95)
+    found, row = from_command.train([], tmp_path / "run", 0.95)
     assert list(found) == ["seconds_to_0.90", "seconds_to_0.95", "saved_s"]
     seconds = [value for value in found.values() if value is not None]
     assert len(seconds) == 3
@@ -53,7 +53,7 @@ def test_what_was_never_reached_has_no_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _put(tmp_path, monkeypatch, [0.5, 0.92], end="")
-    found, row = command_to_success.train([], tmp_path / "run", 0.95)
+    found, row = from_command.train([], tmp_path / "run", 0.95)
     assert found["seconds_to_0.90"] is not None
     assert found["seconds_to_0.95"] is None
     assert row["success_by_stage"] == [1.0, 0.92]
