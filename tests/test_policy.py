@@ -23,8 +23,10 @@ from policies import Arrays, saved, several
 
 from swarmjax import epuck, policy, policy_file
 from swarmjax.policy import Policy, PolicyError
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.sim import drive
 from swarmjax.sim.config import RobotConfig
 from swarmjax.task import observation
@@ -381,7 +383,7 @@ def test_an_action_does_not_depend_on_what_is_computed_beside_it(
     np.testing.assert_array_equal(together, alone)
 
 
-def _exported(learner: ppo.LearnerState) -> Arrays:
+def _exported(learner: LearnerState) -> Arrays:
     """Returns a learner's arrays by their names in the policy file."""
     actor = jax.tree.map(lambda leaf: np.asarray(leaf)[None], learner.params["actor"])
     layers = {**actor["torso"], "mean": actor["mean"]}
@@ -399,7 +401,8 @@ def _exported(learner: ppo.LearnerState) -> Arrays:
 @pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
 def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any) -> None:
     config = AlgoConfig(hidden_sizes=(64, 64), activation=activation)
-    learner = ppo.init(jax.random.key(0), config, SIZE, ACTIONS, updates=1)
+    ppo = PPO.make(config, Sizes(SIZE, ACTIONS), updates=1)
+    learner = ppo.init(jax.random.key(0))
     draw = np.random.default_rng(4)
     # The last layer starts with a gain of 0.01, which is too small to tell networks apart.
     params = jax.tree.map(
@@ -409,12 +412,12 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     names = observation.NAMES
     spread = _f32(by_name(names, infrared=0.01, distance=2.0, bearing=1e-9, other=1.0))
     batch = draw.normal(size=(64, SIZE)).astype(np.float32) * spread
-    moments = ppo.normalizer.update(learner.normalizer, jnp.asarray(batch), jnp.ones(64, bool))
+    moments = normalizer.update(learner.normalizer, jnp.asarray(batch), jnp.ones(64, bool))
     learner = dataclasses.replace(learner, params=params, normalizer=moments)
     loaded = saved(tmp_path / "policy.npz", _exported(learner), activation=activation)
     # Thirty deviations reach beyond the normaliser's limit of 10.
     seen = draw.normal(size=(40, 3, SIZE)).astype(np.float32) * spread * 30
-    expected = np.asarray(ppo.mode(learner, config, jnp.asarray(seen)))
+    expected = np.asarray(ppo.act(learner, jnp.asarray(seen), jnp.zeros((40, 3, ACTIONS)))[0])
     assert np.ptp(expected, axis=(0, 1)).min() > 1.0  # The observation matters.
     # Three sums of 64 float32 terms or fewer are added in another order. Each is off by about
     # 64 * 2**-24 = 4e-6 of its largest term, which is below 10.

@@ -66,6 +66,11 @@ def shards_of(config: ProgramConfig) -> Shards:
     return Shards(config.arena_devices, config.stream_count)
 
 
+def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) -> Program[C]:
+    """Builds the program of an environment that is there already; otherwise as `load`."""
+    return Program(config, world, load_ppo(config, world), by_robot)
+
+
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
     """Builds the program and the curriculum's numbers; resolves every setting left to `auto`.
 
@@ -80,8 +85,7 @@ def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Progra
       ConfigError: Warp is required but not installed, the gradient's backend is not available, or a
         part of an extension does not fit.
     """
-    world = load_world(config)
-    return Program(config, world, load_ppo(config, world), by_robot), schedule(config)
+    return build(config, load_world(config), by_robot=by_robot), schedule(config)
 
 
 def load_ppo(config: ProgramConfig, world: World) -> PPO:

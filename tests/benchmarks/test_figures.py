@@ -57,7 +57,7 @@ def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
         run=replace(tiny_config.run, chunk="all", tensorboard=False),
         budget=ARENAS * ROLLOUT * 2,  # two updates of each seed
     )
-    return Program(config, tiny_world)
+    return programs.build(config, tiny_world)
 
 
 class Calls(NamedTuple):

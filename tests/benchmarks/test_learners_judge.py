@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 from policies import EMBODIMENT
@@ -18,8 +19,9 @@ from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task import env, level, observation
 from swarmjax.task import stage as task_stage
@@ -49,7 +51,8 @@ def world() -> World:
 @pytest.fixture(scope="module")
 def judge(world: World) -> Run:
     algo = AlgoConfig(hidden_sizes=(2,), activation="relu")
-    return jax.jit(partial(learners_judge.outcomes, world, algo, steps=STEPS))
+    ppo = learners.ppo(algo, Sizes(observation.SIZE, 2))
+    return jax.jit(partial(learners_judge.outcomes, world, ppo, steps=STEPS))
 
 
 @pytest.fixture(scope="module", params=STAGES, ids=lambda stage: stage.name)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks import race
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.observation import SIZE
 from tests.sentences import refusal
@@ -88,7 +89,9 @@ def test_the_judge_sees_the_policy_that_brax_trained(tiny_config: TrainConfig) -
     policy = networks.make_inference_fn(made)(params, deterministic=True)
     theirs, _ = policy(seen, jax.random.key(2))
     learners = race.as_learners(tiny_config, params)
-    mine = ppo.mode(jax.tree.map(lambda x: x[0, 0], learners), tiny_config.algo, seen)
+    ppo = PPO.make(tiny_config.algo, Sizes(seen.shape[-1], 2), 1)
+    still = jnp.zeros((*seen.shape[:-1], 2))
+    mine, _, _ = ppo.act(jax.tree.map(lambda x: x[0, 0], learners), seen, still)
     np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-7)  # rounding of float32
     std = np.exp(learners.params["actor"]["log_std"])
     np.testing.assert_allclose(std, 0.6, rtol=1e-6)

@@ -31,12 +31,10 @@ from swarmjax.curriculum.engine import (
     StageChoice,
 )
 from swarmjax.curriculum.stages import MODES, StagesState
-from swarmjax.ppo import learner as ppo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig, SimConfig
-from swarmjax.task import observation
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.episode import Ended
 from swarmjax.task.stage_config import StageConfig
@@ -418,9 +416,7 @@ def step() -> Step:
         arenas=ARENAS,
     )
     program, schedule = programs.load(config)
-    keys = jax.random.split(jax.random.key(1), 1)
-    sizes = (observation.SIZE, programs.ACTION_SIZE, config.updates)
-    learners = jax.vmap(lambda key: ppo.init(key, config.algo, *sizes))(keys)
+    learners = jax.vmap(program.ppo.init)(jax.random.split(jax.random.key(1), 1))
 
     draw = jax.jit(functools.partial(rollout.draw_starts, program.world, schedule.stages))
     collect = jax.jit(functools.partial(rollout.collect, program))

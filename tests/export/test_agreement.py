@@ -8,6 +8,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import learners as ppo_parts
 import numpy as np
 import policies
 import pytest
@@ -19,6 +20,7 @@ from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.networks import Hearing, Sizes
 from swarmjax.task.config import NeighboursConfig
 
 OBSERVATIONS = 10_000
@@ -26,6 +28,7 @@ OBSERVATIONS = 10_000
 # of up to 2.5 units (tanh) by 1.1e-6, and actions of up to 16 units (relu, swish) by 8.2e-6. The
 # full range of commands is 2 units.
 TOLERANCE = 1e-5
+SIZES = 10, 2  # numbers of an observation and of an action
 Activation = Literal["tanh", "relu", "swish"]
 
 
@@ -45,8 +48,8 @@ def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.nda
             variance=mine["normalizer/std"] ** 2,
             rest=jnp.zeros((2, 1)),
         )
-        features = normalizer.normalize(moments, observation, 10.0)
-        return networks.action_distribution({"actor": actor}, config, features)[0]
+        features = normalizer.normalize(moments, observation)
+        return ppo_parts.nets(config, *SIZES).act({"actor": actor}, features, ()).mean
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
     return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
@@ -122,9 +125,10 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
             variance=mine["normalizer/std"] ** 2,
             rest=jnp.zeros((2, 1)),
         )
-        features = normalizer.normalize(moments, observation, 10.0)
+        features = normalizer.normalize(moments, observation)
         none = jnp.zeros(MEMORY)
-        return networks.recall_action({"actor": actor}, config, features, none, begins)[0]
+        nets = ppo_parts.nets(config, *SIZES)
+        return nets.act({"actor": actor}, features, none, begins).mean
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
     return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
@@ -201,7 +205,9 @@ def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.nda
     """Returns actions [T, R, U] of the Flax networks that hear, with or without a memory."""
     memory = {"memory": "gru", "memory_size": MEMORY} if kind == "gru" else {}
     size, heard = seen.shape[-1], NeighboursConfig(count=HEARD, message_size=SAID)
-    config = networks.bind_hearing(AlgoConfig(**memory), size, heard.count, heard.width)
+    place = Hearing(size - heard.count * heard.width, heard.count, heard.width)
+    sizes = Sizes(size, 2 + SAID, hearing=place)
+    nets = networks.make(AlgoConfig(**memory), sizes)
 
     def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
         def layer(name: str) -> dict[str, jax.Array]:
@@ -210,17 +216,16 @@ def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.nda
         actor = {name: layer(name) for name in ("hearing", "mean")}
         actor |= {"torso": {f"hidden_{i}": layer(f"hidden_{i}") for i in range(2)}}
         actor |= {"log_std": mine["actor/log_std"]}
-        none = None
+        none, began = (), None
         if kind == "gru":
             actor["memory"] = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
-            none = jnp.zeros(MEMORY)
+            none, began = jnp.zeros(MEMORY), begins
         mean, std = (mine[f"normalizer/{name}"] for name in ("mean", "std"))
         moments = normalizer.Normalizer(
             count=jnp.ones(()), mean=mean, variance=std**2, rest=jnp.zeros((2, 1))
         )
-        features = normalizer.normalize(moments, observation, 10.0)
-        began = None if none is None else begins
-        return networks.recall_action({"actor": actor}, config, features, none, began)[0]
+        features = normalizer.normalize(moments, observation)
+        return nets.act({"actor": actor}, features, none, began).mean
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
     return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))

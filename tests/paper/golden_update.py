@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmjax.ppo import dispatch, networks
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import networks
+from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.memory import NO_MEMORY
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.load_settings import load_train
-from swarmjax.training import rollout
-from swarmjax.training.rollout import Trajectory
 
 PAPER = load_train(["algo=paper"]).algo
 CONFIGS = {
@@ -32,9 +32,15 @@ CONFIGS = {
 TOTAL = 166  # updates of the run; constant learning rates do not depend on it
 
 
+@functools.cache
+def ppo(config: AlgoConfig) -> PPO:
+    """Returns PPO as a run makes it."""
+    return PPO.make(config, Sizes(inputs.OBSERVATION, inputs.ACTION), TOTAL)
+
+
 def learner(config: AlgoConfig) -> LearnerState:
     """Returns a batch of one learner, [1], with the golden weights."""
-    state = ppo.init(jax.random.key(0), config, inputs.OBSERVATION, inputs.ACTION, TOTAL)
+    state = ppo(config).init(jax.random.key(0))
     drawn = inputs.draw().layers
     params = {
         network: {
@@ -58,7 +64,7 @@ def _layer(drawn: tuple[np.ndarray, np.ndarray]) -> dict[str, jax.Array]:
 
 
 def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajectory:
-    """Returns the golden batch as a rollout of one arena, [T, 1, 1, 1].
+    """Returns the golden batch as a rollout of one arena, [T, 1, 1].
 
     Args:
       state: state of the learner, [1], that collects the batch.
@@ -70,9 +76,10 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
     alone = jax.tree.map(lambda x: x[0], state)
     observation = jnp.asarray(drawn.observation, float)
     # `act` uses the learner's current deviation, which here is the same for the whole batch.
-    action, log_prob = ppo.act(alone, config, observation, jnp.asarray(drawn.noise, float))
+    noise = jnp.asarray(drawn.noise, float)
+    action, log_prob, _ = ppo(config).act(alone, observation, noise)
     terminated, truncated = inputs.ends(inputs.ARRIVALS), inputs.ends(inputs.TIME_OUTS)
-    value = ppo.values(alone, config, observation)
+    value, _ = ppo(config).value(alone, observation)
     columns = Trajectory(
         observation=observation,
         action=action,
@@ -86,7 +93,7 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
     )
     if idle:
         columns = jax.tree.map(lambda x: _insert(x, idle), columns)
-    return jax.tree.map(lambda x: x[:, None, None, None], columns)
+    return jax.tree.map(lambda x: x[:, None, None], columns)
 
 
 def _insert(column: jax.Array, idle: int) -> jax.Array:
@@ -108,13 +115,11 @@ def flat(params: networks.Params) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnames="epochs")
 def _learn(
-    state: LearnerState, batch: ppo.Batch, epochs: int
+    state: LearnerState, batch: Batch, epochs: int
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     config = replace(PAPER, epochs=epochs)
     keys = jax.random.split(jax.random.key(0), 1)
-    backend = dispatch.resolve(config, inputs.OBSERVATION, inputs.ACTION)  # as a run does
-    update = jax.vmap(lambda s, b, k: ppo.update(s, config, b, k, TOTAL, backend))
-    return update(state, batch, keys)
+    return jax.vmap(ppo(config).update)(state, batch, keys)
 
 
 def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:
@@ -134,8 +139,11 @@ def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict
         golden = {k.partition("/")[2]: archive[k] for k in archive if k.startswith(f"{case}/")}
     config = CONFIGS[case]
     state = learner(config)
-    batch = rollout.batch(trajectory(state, config, idle), config)
-    state = jax.vmap(lambda one: ppo.explore(one, config, inputs.STEPS + (case == "std")))(state)
+    made, steps = ppo(config), inputs.STEPS + (case == "std")
+    path = trajectory(state, config, idle)
+    batch = made.batch(path, NO_MEMORY, jnp.zeros(path.valid.shape[:2], bool))
+    batch = jax.tree.map(lambda x: x[None], batch)
+    state = jax.vmap(lambda one: made.explore(one, steps))(state)
     found = {}
     if "returns" in golden:
         valid = np.asarray(batch.valid[0, 0])

@@ -98,9 +98,8 @@ def _round(
         program, state.learners, state.arenas, starts, rollout_key
     )
     learners = rollout.explore(program, state.learners, config.algo.rollout_length)
-    mean = jax.vmap(lambda one, seen: loop.ppo.mode(one, config.algo, seen), in_axes=(0, 1))(
-        learners, path.observation
-    )
+    still = jnp.zeros_like(path.action)
+    mean = jax.vmap(program.ppo.act, in_axes=(0, 1, 1))(learners, path.observation, still)[0]
     found = {
         "square": jnp.sum((path.action[:, 0, 0, 0] - mean[0, :, 0, 0]) ** 2, axis=-1),
         "log_prob": path.log_prob[:, 0, 0, 0],

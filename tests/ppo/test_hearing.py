@@ -120,9 +120,11 @@ def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
 
 def test_the_kernels_are_not_taken_for_robots_that_hear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dispatch, "_has_tensor_cores", lambda: True)
-    heard = networks.bind_hearing(AlgoConfig(), 10 + COUNT * WIDTH, COUNT, WIDTH)
-    assert dispatch.resolve(AlgoConfig(), 10 + COUNT * WIDTH, 2) == "fused"
-    assert dispatch.resolve(heard, 10 + COUNT * WIDTH, 2) == "autodiff"
+    plain = Sizes(10 + COUNT * WIDTH, 2)
+    heard = plain._replace(hearing=Hearing(10, COUNT, WIDTH))
+    for sizes, backend in ((plain, "fused"), (heard, "autodiff")):
+        nets = networks.make(AlgoConfig(), sizes)
+        assert dispatch.resolve(AlgoConfig(), nets, sizes) == backend
 
 
 # A probe with pairs of robots. Each robot sees a number, -1 or 1, and its partner is rewarded for

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 from flax import linen as nn
@@ -14,10 +15,11 @@ from flax import linen as nn
 from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
-from swarmjax.ppo import dispatch, networks
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import dispatch, networks, ppo
+from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch, LearnerState
+from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig
@@ -27,7 +29,7 @@ from swarmjax.task.env import EnvState
 from swarmjax.training import loop, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena, Trajectory
+from swarmjax.training.rollout import Arena
 
 UPDATES = 3
 
@@ -40,6 +42,7 @@ class Trained(NamedTuple):
     before: Arena
     waiting: Arena
     trajectory: Trajectory
+    over: np.ndarray  # [T, A] whether the episode ended with the step
 
 
 def _algo(config: TrainConfig, **rest: Any) -> AlgoConfig:
@@ -62,8 +65,9 @@ def trained(tiny_config: TrainConfig) -> Trained:
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
-    _, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
-    return Trained(program, last.learners, before, waiting, trajectory)
+    _, trajectory, ended = collect(last.learners, before, waiting, jax.random.key(2))
+    over = np.asarray(ended.episodes) > 0
+    return Trained(program, last.learners, before, waiting, trajectory, over)
 
 
 def _look(trained: Trained, arenas: EnvState) -> np.ndarray:
@@ -77,16 +81,13 @@ def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
 
     `memory` is [A, R, H].
     """
-    config = trained.program.config.algo
     seen, mine = (
         rollout.to_learners(x, trained.program.config.learners)
         for x in (arenas.observation, memory)
     )
     normal = jax.vmap(ppo.normalize)(trained.learners, seen)
-    both = np.concatenate([normal, _look(trained, arenas)], axis=-1)
-    value, _ = jax.vmap(lambda p, s, m: networks.recall_value(p, config, s, m))(
-        trained.learners.params, both, mine
-    )
+    nets = trained.program.ppo.learning.networks
+    value, _ = jax.vmap(nets.value)(trained.learners.params, normal, _look(trained, arenas), mine)
     return np.asarray(value)
 
 
@@ -102,7 +103,7 @@ def _stepped(trained: Trained) -> Arena:
 def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None:
     seen = trained.trajectory.state
     assert seen is not None
-    assert seen.shape[-1] == trained.program.state_size
+    assert seen.shape[-1] == trained.program.ppo.sizes.state
     # Two compiled programs round float32 distances of at most 2 m differently.
     np.testing.assert_allclose(seen[0], _look(trained, trained.before), rtol=0, atol=1e-6)
     # float32 rounding: a single step and the scan are different compiled programs.
@@ -110,11 +111,10 @@ def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None
 
 
 def test_where_an_episode_ends_it_is_shown_the_next_one(trained: Trained) -> None:
-    seen, over = trained.trajectory.state, trained.trajectory.over
+    seen, over = trained.trajectory.state, trained.over
     assert seen is not None
-    assert over is not None
     first = _look(trained, trained.waiting)
-    steps, arenas = np.nonzero(np.asarray(over)[:-1, 0, :, 0])
+    steps, arenas = np.nonzero(over[:-1])
     assert len(steps) > 2
     for step, arena in zip(steps, arenas, strict=True):
         # Two compiled programs round differently.
@@ -131,9 +131,9 @@ def test_its_value_is_that_of_observation_and_state(trained: Trained) -> None:
 
 
 def test_the_next_value_is_of_what_the_step_reached(trained: Trained) -> None:
-    found, over = trained.trajectory, trained.trajectory.over
-    assert over is not None
-    going = ~np.asarray(over)[:-1]
+    found, over = trained.trajectory, trained.over
+    # [T - 1, L, A, N], as the values
+    going = np.broadcast_to(~over[:-1, None, :, None], found.value[1:].shape)
     assert not going.all()
     np.testing.assert_array_equal(
         np.asarray(found.next_value)[:-1][going], np.asarray(found.value)[1:][going]
@@ -146,7 +146,7 @@ def test_the_next_value_is_of_what_the_step_reached(trained: Trained) -> None:
 def test_the_actor_sees_nothing_of_it(trained: Trained) -> None:
     """The actor's first layer takes only the observation; the critic's takes the state as well."""
     params: Any = trained.learners.params
-    size, more = trained.program.world.observation_size, trained.program.state_size
+    size, more = trained.program.world.observation_size, trained.program.ppo.sizes.state
     layer = {side: params[side]["torso"]["hidden_0"]["kernel"] for side in params}
     assert layer["actor"].shape[1] == size
     assert layer["critic"].shape[1] == size + more
@@ -184,6 +184,10 @@ CONFIG = AlgoConfig(
 )
 
 
+def _ppo(config: AlgoConfig = CONFIG, backend: dispatch.Backend = "autodiff") -> PPO:
+    return learners.ppo(config, Sizes(SIZE, 2, STATE), 100, backend)
+
+
 def _batch(learner: LearnerState, seed: int) -> Batch:
     """Returns samples whose return depends on the state alone."""
     keys = jax.random.split(jax.random.key(seed), 3)
@@ -191,7 +195,7 @@ def _batch(learner: LearnerState, seed: int) -> Batch:
     observation = jax.random.normal(keys[0], (*shape, SIZE))
     noise = jax.random.normal(keys[1], (*shape, 2))
     state = jax.random.normal(keys[2], (*shape, STATE))
-    action, log_prob = ppo.act(learner, CONFIG, observation, noise)
+    action, log_prob, _ = _ppo().act(learner, observation, noise)
     return Batch(
         observation=observation,
         action=action,
@@ -205,8 +209,7 @@ def _batch(learner: LearnerState, seed: int) -> Batch:
 
 def _learn(told: bool) -> float:
     """Trains a critic with the state, or with zeros in its place; returns the last value loss."""
-    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
-    update = jax.jit(lambda *given: ppo.update(given[0], CONFIG, *given[1:], updates=100))
+    learner, update = _ppo().init(jax.random.key(0)), jax.jit(_ppo().update)
     loss = np.inf
     for step in range(100):
         batch = _batch(learner, step)
@@ -228,38 +231,36 @@ def test_a_state_changes_nothing_of_the_policy_but_by_its_guess(
 ) -> None:
     # No clipping here: it scales both networks by one norm, so the critic would change the actor.
     config = replace(CONFIG, num_minibatches=1, max_grad_norm=None, guess_cost=0.0)
-    learner = ppo.init(jax.random.key(0), config, SIZE, 2, 100, STATE)
+    made = _ppo(config, backend)
+    learner = made.init(jax.random.key(0))
     batch = replace(_batch(learner, 0), advantage=_batch(learner, 1).return_)
     other = replace(batch, state=jnp.zeros((8, 32, STATE)))
-    one, two = (
-        ppo.update(learner, config, each, jax.random.key(0), 100, backend)[0].params
-        for each in (batch, other)
-    )
+    one, two = (made.update(learner, each, jax.random.key(0))[0].params for each in (batch, other))
     jax.tree.map(np.testing.assert_array_equal, one["actor"], two["actor"])
     kernels = [each["critic"]["torso"]["hidden_0"]["kernel"] for each in (one, two)]
     assert np.abs(kernels[0] - kernels[1]).max() > 0.0
 
 
 def test_a_state_that_is_not_finite_is_left_out() -> None:
-    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
+    learner = _ppo().init(jax.random.key(0))
     batch = _batch(learner, 0)
     assert batch.state is not None
     spoilt = replace(batch, state=batch.state.at[0, 0, 0].set(jnp.nan))
     without = replace(batch, valid=batch.valid.at[0, 0].set(False))
     found, expected = (
-        ppo.update(learner, CONFIG, each, jax.random.key(0), 100)[0] for each in (spoilt, without)
+        _ppo().update(learner, each, jax.random.key(0))[0] for each in (spoilt, without)
     )
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_what_is_not_valid_may_hold_nan() -> None:
-    learner = ppo.init(jax.random.key(0), CONFIG, SIZE, 2, 100, STATE)
+    learner = _ppo().init(jax.random.key(0))
     batch = _batch(learner, 0)
     assert batch.state is not None
     valid = batch.valid.at[:, ::2].set(False)
     holes = jnp.where(valid[..., None], batch.state, jnp.nan)
     found, expected = (
-        ppo.update(learner, CONFIG, replace(batch, valid=valid, state=x), jax.random.key(0), 100)[0]
+        _ppo().update(learner, replace(batch, valid=valid, state=x), jax.random.key(0))[0]
         for x in (holes, batch.state)
     )
     jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -278,7 +279,8 @@ def test_the_policy_file_acts_as_the_learner_and_holds_no_guess(
     learner = jax.tree.map(lambda leaf: leaf[0], state.learners)
     found = policy.act(policy_file.read(tmp_path / "policy.npz"), seen[:, None])[:, 0]
     # float32, sums of ten terms
-    np.testing.assert_allclose(found, ppo.mode(learner, config.algo, seen), atol=2e-6)
+    mode, _, _ = program.ppo.act(learner, seen, np.zeros_like(found))
+    np.testing.assert_allclose(found, mode, atol=2e-6)
 
 
 # --- settings that do not go with a critic of the state
@@ -296,6 +298,7 @@ def test_a_network_that_takes_the_observation_alone_is_refused() -> None:
             return observation.reshape(-1, SIZE)
 
     own = [Network(name="fixed", function=Fixed)]
-    assert networks.bind(replace(CONFIG, network="fixed"), own, SIZE).torso is Fixed
+    config = replace(CONFIG, network="fixed")
+    assert networks.make(config, Sizes(SIZE, 2), own).actor.torso is Fixed
     with pytest.raises(ConfigError, match="network fixed for a critic of the state turns"):
-        networks.bind(replace(CONFIG, network="fixed"), own, SIZE, STATE)
+        networks.make(config, Sizes(SIZE, 2, STATE), own)

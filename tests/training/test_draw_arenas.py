@@ -14,14 +14,13 @@ from swarmjax.task.env import World
 from swarmjax.training import loop
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
 
 
 @pytest.fixture(scope="module")
 def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, TrainState]:
     """Returns a state on the second stage with counted episodes, without and with new arenas."""
     algo = replace(tiny_config.algo, memory="gru", memory_size=4)
-    program = Program(replace(tiny_config, algo=algo), tiny_world)
+    program = programs.build(replace(tiny_config, algo=algo), tiny_world)
     schedule = programs.schedule(tiny_config)
     begun = jax.jit(partial(loop.init, program))(schedule)
     remembered = jax.tree.map(lambda x: x + 1.0, begun.arenas.recall)

@@ -7,13 +7,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import Batch
+from swarmjax.ppo.networks import Sizes
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
@@ -42,7 +43,7 @@ def program(tiny_config: TrainConfig) -> Program:
         algo=replace(algo, initialization="uniform"),
         sim=replace(tiny_config.sim, max_robots=1, max_obstacles=0),
     )
-    return Program(config, programs.load_world(config))
+    return programs.build(config, programs.load_world(config))
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +114,8 @@ def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
     """Two of four groups are valid: an epoch takes one step if one minibatch has both, else two."""
     epochs, groups = 12, 4
     config = AlgoConfig(hidden_sizes=(4,), epochs=epochs, num_minibatches=2)
-    learner = ppo.init(jax.random.key(0), config, 3, 2, 1)
+    ppo = learners.ppo(config, Sizes(3, 2), 1, "autodiff")
+    learner = ppo.init(jax.random.key(0))
     zeros = jnp.zeros((groups, 1))
     batch = Batch(
         observation=jnp.zeros((groups, 1, 3)),
@@ -123,7 +125,7 @@ def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
         return_=zeros,
         valid=jnp.array([[True], [True], [False], [False]]),
     )
-    learned, _ = jax.jit(lambda key: ppo.update(learner, config, batch, key, 1))(jax.random.key(1))
+    learned, _ = jax.jit(ppo.update)(learner, batch, jax.random.key(1))
     counts = optax.tree.get_all_with_path(learned.optimizer_state, "count")
     (steps,) = {int(count) for _, count in counts}
     # With the same order in every epoch, there would be 12 or 24 steps.

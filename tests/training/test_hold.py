@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 import swarmjax
-from swarmjax.ppo import learner as ppo
 from swarmjax.run.settings import TrainConfig
-from swarmjax.task import env, observation
+from swarmjax.task import env
 from swarmjax.task.env import World
 from swarmjax.task.episode import Ended
+from swarmjax.training import program as programs
 from swarmjax.training import rollout
-from swarmjax.training.program import ACTION_SIZE, Program
 from swarmjax.training.rollout import Arena, Trajectory
 
 ALL, ONE, GOING = range(3)  # arenas
@@ -41,7 +40,7 @@ def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
     """
     task = dataclasses.replace(tiny_config.task, arrival="hold")
     config = dataclasses.replace(tiny_config, task=task)
-    program = Program(config, dataclasses.replace(tiny_world, task=task))
+    program = programs.build(config, dataclasses.replace(tiny_world, task=task))
     scene = holding.level(robots=3, obstacles=2)
     there = scene.start[:, :2].copy()
     one = np.array([there[0], scene.target[1], there[2]])
@@ -52,10 +51,7 @@ def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
     starts = Arena(**vars(begun), stage=none, cohort=none)
     before = dataclasses.replace(starts, clock=jnp.array([0, 15, 0], jnp.int32))
 
-    def init(key: jax.Array) -> ppo.LearnerState:
-        return ppo.init(key, config.algo, observation.SIZE, ACTION_SIZE, config.updates)
-
-    learners = jax.vmap(init)(jax.random.split(jax.random.key(1), 1))
+    learners = jax.vmap(program.ppo.init)(jax.random.split(jax.random.key(1), 1))
     collect = jax.jit(functools.partial(rollout.collect, program))
     _, trajectory, ended = collect(learners, before, starts, jax.random.key(2))
     return Run(*jax.tree.map(np.asarray, (trajectory, ended)))

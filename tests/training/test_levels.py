@@ -15,6 +15,7 @@ from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.config import CurriculumConfig, LevelsConfig
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.levels import LevelBuffer
+from swarmjax.ppo.batch import value_loss
 from swarmjax.run.checkpoint import digest, from_leaves, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import extended, level
@@ -149,9 +150,9 @@ def test_value_loss_of_a_rollout(trained: Trained) -> None:
     arenas = replace(state.arenas, clock=jnp.array([0, 9, 10, 11, 12, 13, 14, 15], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
     _, trajectory, ended = collect(state.learners, arenas, waiting, jax.random.key(6))
-    batch = rollout.batch(trajectory, program.config.algo)
-    loss = np.asarray(jax.jit(rollout.value_loss)(batch, ended))
     over = np.asarray(ended.episodes) > 0
+    batch = rollout.batch(program, trajectory, arenas.recall, ended, 1)
+    loss = np.asarray(jax.jit(value_loss)(batch, over))
     steps, robots = over.shape[0], np.asarray(trajectory.valid).shape[-1]
     advantage = np.asarray(batch.advantage).reshape(8, steps, robots)
     valid = np.asarray(batch.valid).reshape(8, steps, robots)

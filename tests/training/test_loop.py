@@ -27,7 +27,7 @@ Chunk = Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
 
 @pytest.fixture(scope="module")
 def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
-    return Program(tiny_config, tiny_world)
+    return programs.build(tiny_config, tiny_world)
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +258,7 @@ def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
         algo=replace(tiny_config.algo, policy="independent"),
         curriculum=CurriculumConfig(threshold=1.0),
     )
-    program = Program(config, tiny_world)
+    program = programs.build(config, tiny_world)
     schedule = programs.schedule(config)
     init = jax.jit(partial(loop.init, program))
     return lambda: init(schedule), jax.jit(partial(loop.train_chunk, program, schedule))

@@ -8,20 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from swarmjax.ppo.learner import Batch, LearnerState
 
-from swarmjax.ppo import learner as ppo
-from swarmjax.ppo import losses, networks
+from swarmjax.ppo import gaussian, losses, ppo
+from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
-from swarmjax.task import observation
-from swarmjax.task.env import World
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena, Trajectory
+from swarmjax.training.rollout import Arena
 
 SIZE, UPDATES = 4, 6
 
@@ -33,6 +31,7 @@ class Trained(NamedTuple):
     states: list[TrainState]
     arenas: Arena
     trajectory: Trajectory
+    over: np.ndarray  # [T, A] whether the episode ended with the step
     batch: Batch
 
 
@@ -58,9 +57,10 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     collect = jax.jit(partial(rollout.collect, program))
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
-    arenas, trajectory, _ = collect(last.learners, before, waiting, jax.random.key(2))
-    batch = rollout.batch(trajectory, config.algo, memory=before.recall)
-    return Trained(program, states, arenas, trajectory, batch)
+    arenas, trajectory, ended = collect(last.learners, before, waiting, jax.random.key(2))
+    batch = rollout.batch(program, trajectory, before.recall, ended, config.learners)
+    over = np.asarray(ended.episodes) > 0
+    return Trained(program, states, arenas, trajectory, over, batch)
 
 
 def _one(learners: LearnerState) -> LearnerState:
@@ -74,11 +74,12 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     # The arenas are in another order, as in minibatches.
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
-    (mean, std, *_), value = losses.evaluate(_one(learners).params, config, minibatch)
-    log_prob = networks.log_prob(mean, std, minibatch.action)
+    nets = trained.program.ppo.learning.networks
+    (mean, std, *_), value = losses.evaluate(_one(learners).params, nets, minibatch)
+    log_prob = gaussian.log_prob(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
-    assert np.asarray(trained.trajectory.over).any()  # episodes end within the rollout
+    assert trained.over.any()  # episodes end within the rollout
     tolerance = {"rtol": 0, "atol": 2e-6}  # float32; matrix products of another batch size
     np.testing.assert_allclose(log_prob[valid], minibatch.log_prob[valid], **tolerance)
     seen = np.asarray(trained.trajectory.value[:, 0])[:, rows].reshape(-1)
@@ -86,10 +87,8 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
 
 
 def test_a_robot_forgets_where_its_episode_begins(trained: Trained) -> None:
-    over, recall = trained.trajectory.over, trained.arenas.recall
-    assert over is not None
-    assert recall is not None
-    over = np.asarray(over[-1, 0, :, 0])
+    recall = trained.arenas.recall
+    over = trained.over[-1]
     begun = np.asarray(trained.arenas.clock) == 0
     np.testing.assert_array_equal(begun, over)
     assert (np.asarray(recall.actor)[begun] == 0.0).all()
@@ -103,43 +102,3 @@ def test_a_memory_is_trained(trained: Trained) -> None:
         for side in ("actor", "critic"):
             name = f"learners/params/{side}/memory/{part}/kernel"
             assert np.abs(last[name] - first[name]).max() > 1e-4, name
-
-
-class Seen(NamedTuple):
-    """A rollout of robots with a history of three observations, by untrained learners."""
-
-    config: TrainConfig
-    state: TrainState
-    observation: np.ndarray  # [T + 1, A, R, 3 O]
-    over: np.ndarray  # [T, A] whether the episode ended with the step
-    action: np.ndarray  # [T, A, R, U], the most likely action of each of the T steps
-
-
-@pytest.fixture(scope="module")
-def stacked(tiny_config: TrainConfig, tiny_world: World) -> Seen:
-    task = replace(tiny_config.task, history=3)
-    world = replace(tiny_world, task=task)
-    program = Program(replace(tiny_config, task=task), world)
-    schedule = programs.schedule(program.config)
-    first = jax.jit(partial(loop.init, program))(schedule)
-    waiting = loop._draw(program, schedule, first.curriculum, jax.random.key(1), waiting=1)
-    # The arenas are in the middle of their episodes, which end at 16 steps.
-    before = replace(first.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
-    collect = jax.jit(partial(rollout.collect, program))
-    after, found, ended = collect(first.learners, before, waiting, jax.random.key(2))
-    seen = np.concatenate([found.observation[:, 0], np.asarray(after.observation)[None]])
-    action, _ = ppo.recall_mode(_one(first.learners), program.config.algo, seen[:-1], None)
-    return Seen(program.config, first, seen, np.asarray(ended.episodes) > 0, np.asarray(action))
-
-
-def test_a_rollout_sees_what_was_seen_before_and_forgets_where_an_episode_begins(
-    stacked: Seen,
-) -> None:
-    assert stacked.state.learners.normalizer.mean.shape == (1, 3 * observation.SIZE)
-    looks = np.split(stacked.observation, 3, axis=-1)
-    over = stacked.over[..., None, None]
-    assert over.any()
-    for age in (1, 2):
-        # Each step moves the history by one place, and a new episode begins with a history of 0.
-        np.testing.assert_array_equal(looks[age][1:], np.where(over, 0.0, looks[age - 1][:-1]))
-    assert (np.abs(looks[2][-1]).max(axis=(1, 2)) > 0.0).sum() == 8 - over[-2:].any(axis=0).sum()

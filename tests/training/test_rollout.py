@@ -13,10 +13,11 @@ from entries import DISTANCE, INFRARED
 
 from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.engine import Next
-from swarmjax.ppo import gae
-from swarmjax.ppo import learner as ppo
+from swarmjax.ppo import batch, gae
+from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.learner import LearnerState
+from swarmjax.ppo.memory import NO_MEMORY
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, observation
@@ -24,9 +25,10 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.episode import Ended
 from swarmjax.task.level import Level
+from swarmjax.training import program as programs
 from swarmjax.training import rollout
-from swarmjax.training.program import ACTION_SIZE, Program
-from swarmjax.training.rollout import Arena, Trajectory
+from swarmjax.training.program import Program
+from swarmjax.training.rollout import Arena
 
 ArenaStep = Callable[[Arena, jax.Array], tuple[Arena, TimeStep]]
 Draw = Callable[[int, int], Arena]
@@ -61,17 +63,12 @@ class Replay(NamedTuple):
 
 @pytest.fixture(scope="module")
 def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
-    return Program(tiny_config, tiny_world)
+    return programs.build(tiny_config, tiny_world)
 
 
 @pytest.fixture(scope="module")
-def learners(tiny_config: TrainConfig) -> LearnerState:
-    algo, updates = tiny_config.algo, tiny_config.updates
-
-    def init(key: jax.Array) -> LearnerState:
-        return ppo.init(key, algo, observation.SIZE, ACTION_SIZE, updates)
-
-    return jax.vmap(init)(jax.random.split(jax.random.key(1), 1))
+def learners(program: Program) -> LearnerState:
+    return jax.vmap(program.ppo.init)(jax.random.split(jax.random.key(1), 1))
 
 
 @pytest.fixture(scope="module")
@@ -138,10 +135,20 @@ def replay(tiny_world: World, run: Run, tiny_step: ArenaStep) -> Replay:
     return Replay(came, observed, pose, fresh, state)
 
 
-def _values(config: TrainConfig, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
+def _values(program: Program, learners: LearnerState, seen: np.ndarray) -> np.ndarray:
     """Returns the values [..., A, R] of the only learner."""
     one = jax.tree.map(lambda leaf: leaf[0], learners)
-    return np.asarray(ppo.values(one, config.algo, jnp.asarray(seen)))
+    return np.asarray(program.ppo.value(one, jnp.asarray(seen))[0])
+
+
+def _samples(trajectory: Trajectory, config: AlgoConfig) -> Batch:
+    """Returns the samples [L] of a trajectory [T, L, A, N, ...] in which no episode ended."""
+    over = jnp.zeros((trajectory.valid.shape[0], trajectory.valid.shape[2]), bool)
+
+    def one(mine: Trajectory) -> Batch:
+        return batch.make(mine, NO_MEMORY, over, config)
+
+    return jax.vmap(one, in_axes=1)(trajectory)
 
 
 def _at[Tree](tree: Tree, where: Any) -> Tree:
@@ -200,7 +207,7 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
         discount=0.9,
         gae_lambda=0.8,
     )
-    found = rollout.batch(trajectory, AlgoConfig(discount=0.9, gae_lambda=0.8))
+    found = _samples(trajectory, AlgoConfig(discount=0.9, gae_lambda=0.8))
     for t, learner, arena, robot in np.ndindex(*shape):
         mine, sample = (learner, arena, t * robots + robot), (t, learner, arena, robot)
         np.testing.assert_array_equal(found.observation[mine], trajectory.observation[sample])
@@ -215,13 +222,13 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
 def test_a_step_limit_may_be_terminal_to_bootstrapped_returns() -> None:
     trajectory = _random_trajectory((20, 2, 3, 1))
     config = AlgoConfig(discount=0.9, time_out="terminal")
-    found = rollout.batch(trajectory, config).return_[..., 0]
+    found = _samples(trajectory, config).return_[..., 0]
     # A sample where physics broke is truncated and not valid. Its return still bootstraps.
     timed_out = trajectory.truncated & trajectory.valid
     terminal = trajectory._replace(terminated=trajectory.terminated | timed_out)
-    expected = rollout.batch(terminal, AlgoConfig(discount=0.9)).return_[..., 0]
+    expected = _samples(terminal, AlgoConfig(discount=0.9)).return_[..., 0]
     np.testing.assert_array_equal(found, expected)
-    assert np.any(found != rollout.batch(trajectory, AlgoConfig(discount=0.9)).return_[..., 0])
+    assert np.any(found != _samples(trajectory, AlgoConfig(discount=0.9)).return_[..., 0])
 
 
 @pytest.mark.parametrize("time_out", ["terminal", "leak"])
@@ -229,7 +236,7 @@ def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
     shape = (20, 2, 3, 1)
     trajectory = _random_trajectory(shape)
     config = AlgoConfig(discount=0.9, advantage="monte_carlo", time_out=time_out)
-    found = rollout.batch(trajectory, config)
+    found = _samples(trajectory, config)
     reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:9])
     following, returns = np.zeros(shape[1:]), np.zeros(shape)
     for t in reversed(range(shape[0])):
@@ -332,7 +339,7 @@ def test_an_arena_that_is_not_finite_is_left_out_counted_and_begun_anew(
         sound[1],
     )
     # All samples that the learners use are finite.
-    samples = rollout.batch(jax.tree.map(jnp.asarray, trajectory), program.config.algo)
+    samples = _samples(jax.tree.map(jnp.asarray, trajectory), program.config.algo)
     valid = np.asarray(samples.valid)
     for x in jax.tree.leaves(samples):
         assert np.isfinite(np.asarray(x)[valid]).all()
@@ -373,12 +380,12 @@ def test_some_episodes_end_and_others_go_on(run: Run, replay: Replay) -> None:
 
 
 def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
-    tiny_config: TrainConfig, run: Run, replay: Replay
+    program: Program, run: Run, replay: Replay
 ) -> None:
     found = run.trajectory
-    value = _values(tiny_config, run.learners, replay.seen)
-    next_value = _values(tiny_config, run.learners, replay.came.observation)
-    start = _values(tiny_config, run.learners, np.asarray(run.starts.observation))
+    value = _values(program, run.learners, replay.seen)
+    next_value = _values(program, run.learners, replay.came.observation)
+    start = _values(program, run.learners, np.asarray(run.starts.observation))
     present = replay.seen[..., DISTANCE] > 0.0  # as above
     # 1e-5: a bearing drifts by 2e-4, and an untrained network has a slope of about 0.01.
     np.testing.assert_allclose(found.value[:, 0][present], value[present], atol=1e-5)
@@ -393,10 +400,11 @@ def test_value_after_an_episode_is_of_what_it_came_to_not_of_the_next_start(
     np.testing.assert_array_equal(found.next_value[:-1, 0][going], found.value[1:, 0][going])
 
 
-def test_actions_are_drawn_from_the_policy(tiny_config: TrainConfig, run: Run) -> None:
+def test_actions_are_drawn_from_the_policy(program: Program, run: Run) -> None:
     one = jax.tree.map(lambda leaf: leaf[0], run.learners)
     action, seen = run.trajectory.action[:, 0], jnp.asarray(run.trajectory.observation[:, 0])
-    noise = (action - ppo.mode(one, tiny_config.algo, seen)) / 0.6  # the initial deviation
+    mode, _, _ = program.ppo.act(one, seen, jnp.zeros_like(action))
+    noise = (action - mode) / 0.6  # the initial deviation
     # 384 standard normal numbers: mean within 5 / sqrt(384), variance within 5 sqrt(2 / 384).
     assert abs(noise.mean()) < 0.26
     assert abs(noise.var() - 1.0) < 0.36
@@ -454,9 +462,8 @@ def test_episodes_that_wait_are_begun_in_turn_and_all_count(
     starts = dataclasses.replace(starts, clock=jnp.full(3 * ARENAS, 13, jnp.int32))
     collect = jax.jit(functools.partial(rollout.collect, program))
     after, trajectory, ended = collect(run.learners, before, starts, jax.random.key(2))
-    values = ppo.values(
-        jax.tree.map(lambda x: x[0], run.learners), program.config.algo, starts.observation
-    )
+    one = jax.tree.map(lambda x: x[0], run.learners)
+    values, _ = program.ppo.value(one, starts.observation)
     for arena in range(ARENAS):
         if arena in (BROKEN, ARRIVES):
             continue

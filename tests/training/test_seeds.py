@@ -28,7 +28,7 @@ Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
 def _program(
     config: TrainConfig, world: World, count: int, by: Literal["vmap", "map"], first: int = 0
 ) -> Program:
-    return Program(replace(config, seed=first, seeds=count, seeds_by=by), world)
+    return programs.build(replace(config, seed=first, seeds=count, seeds_by=by), world)
 
 
 def _start(program: Program) -> TrainState:
@@ -228,7 +228,7 @@ def test_networks_know_how_many_learners_train_side_by_side(
 ) -> None:
     algo = replace(tiny_config.algo, policy="independent")  # one for each of three robots
     config = replace(tiny_config, seeds=6, seeds_by=by, algo=algo)
-    assert programs.load(config)[0].config.algo.side_by_side == learners
+    assert programs.load(config)[0].ppo.learning.side_by_side == learners
 
 
 def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
