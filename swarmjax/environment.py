@@ -16,7 +16,7 @@ from jax import Array
 
 from swarmjax import policy_file
 from swarmjax.sim import physics
-from swarmjax.task import env, extended, level, observation
+from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.task.stage import Stage
@@ -99,10 +99,9 @@ class Swarm:
 
     @property
     def observation_space(self) -> Space:
-        """One robot's observation, [O]; with `task.history`, earlier observations come last."""
-        layout, history = self.world.electronics.layout, self.world.task.history
-        names = observation.stacked_names(layout.names, history)
-        return Space((len(names),), names, layout.units * history, None, None)
+        """One robot's observation, [O]."""
+        layout = self.world.electronics.layout
+        return Space((layout.size,), layout.names, layout.units, None, None)
 
     @property
     def action_space(self) -> Space:

@@ -169,27 +169,6 @@ def test_words_of_the_command_line_are_settings_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_policy_with_a_history_is_trained_and_judged(tmp_path: Path) -> None:
-    settings = TINY | {"task.history": 3, "run.dir": tmp_path / "run", "budget": 16}
-    result = swarmjax.train_policy(settings)
-    assert result.policy.meta["observation"]["history"] == 3
-    assert result.policy.mean.shape == (1, 30)
-    # After one update the normaliser has statistics of the previous observations as well.
-    assert np.ptp(result.policy.std) > 0.0
-    found = swarmjax.evaluate_policy(result.policy, episodes=2, steps=5)
-    assert len(found["cells"]) == 1
-
-
-def test_the_space_of_a_history_names_how_old_its_entries_are() -> None:
-    env = swarmjax.make_env(PAIR, task={"history": 2}, sim={"impl": "jax"}, arenas=2)
-    seen = env.observation_space
-    assert jax.eval_shape(env.reset, jax.random.key(0)).observation.shape == (2, 2, *seen.shape)
-    assert seen.shape == (20,) == (len(seen.units),)
-    assert seen.names[8:11] == ("target_distance", "target_bearing", "infrared_0[-1]")
-    assert seen.names[-1] == "target_bearing[-1]"
-
-
-@pytest.mark.slow
 def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
     settings = TINY | {"stage": extensions.RING, "run.dir": tmp_path / "run", "budget": 16}
     result = swarmjax.train_policy(settings, extensions=str(extensions.OWN))

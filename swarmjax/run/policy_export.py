@@ -76,7 +76,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "policy": trained.algo.policy,
             "learners": trained.learners,
             "activation": trained.algo.activation,
-            "observation": described | _history(trained) | {"limit": normalizer.OBSERVATION_LIMIT},
+            "observation": described | {"limit": normalizer.OBSERVATION_LIMIT},
             "action": {
                 "names": list(names),
                 "units": list(units),
@@ -123,11 +123,6 @@ def _memory(algo: AlgoConfig) -> dict[str, Any]:
     if algo.memory == "none":
         return {}
     return {"memory": {"kind": algo.memory, "size": algo.memory_size}}
-
-
-def _history(trained: TrainConfig) -> dict[str, int]:
-    """Returns the number of observations in the policy's input, if there is more than one."""
-    return {} if trained.task.history == 1 else {"history": trained.task.history}
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:

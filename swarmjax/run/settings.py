@@ -256,11 +256,6 @@ class TrainConfig(ProgramConfig):
             )
 
     def _check_algo(self) -> None:
-        if self.task.history > 1 and self.algo.memory != "none":
-            raise ConfigError(
-                f"task.history is {self.task.history}, but algo.memory is {self.algo.memory}: "
-                "choose one, task.history=1 or algo.memory=none."
-            )
         self._check_hearing()
         if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
             raise ConfigError(

@@ -161,12 +161,6 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             settings.algo.mean_activation,
             f"algo.mean_activation={output}",
         ),
-        (
-            "task.history",
-            stored.task.history,
-            settings.task.history,
-            f"task.history={stored.task.history}",
-        ),
         *(
             (f"task.neighbours.{key}", *values, f"task.neighbours.{key}={values[0]}")
             for key in ("count", "message_size")

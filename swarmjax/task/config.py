@@ -126,19 +126,8 @@ class TaskConfig(Section):
         default=None,
         metadata=about("observations of extensions, in order; null: all of them"),
     )
-    history: int = field(
-        default=1,
-        metadata=about("observations that the policy sees: the current and earlier ones", 1, 64),
-    )
     neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
-
-    def _check(self) -> None:
-        if self.history > 1 and self.neighbours.count:
-            raise ConfigError(
-                f"history is {self.history}, but neighbours.count is {self.neighbours.count}: "
-                "choose one, history=1 or neighbours.count=0; neighbours work with algo.memory=gru."
-            )
 
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:

@@ -71,8 +71,8 @@ class World:
 
     @property
     def observation_size(self) -> int:
-        """Size of the policy's input, O: all `task.history` observations together."""
-        return self.task.history * self.electronics.layout.size
+        """Size of an observation, O."""
+        return self.electronics.layout.size
 
     @property
     def action_size(self) -> int:
@@ -89,8 +89,7 @@ class EnvState:
       level: the level that the episode started from.
       factors: realism factors of the episode, drawn from the level's seed.
       memory: state of the robots' electronics.
-      observation: [R, O] input of the policy: the current observation, then earlier ones
-        (`task.history`).
+      observation: [R, O] input of the policy.
       clock: [] control steps since the start, int32.
       arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
         its target now.
@@ -229,13 +228,12 @@ def reset(world: World, level: Level) -> EnvState:
     sight = _look(world, level.start, level, factors, None)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
-    nothing = jnp.zeros((robots, world.observation_size), seen.dtype)
     return EnvState(
         sim=physics.rest(world.physics, level.start),
         level=level,
         factors=factors,
         memory=memory,
-        observation=observation.stack(seen, nothing, jnp),
+        observation=seen,
         clock=clock,
         arrived=arrived,
         distance=sight.distance,
@@ -315,7 +313,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
     # Learning skips the step of a broken arena, so the critic need not see it either.
-    seen = jnp.where(sound, observation.stack(seen, state.observation, jnp), state.observation)
+    seen = jnp.where(sound, seen, state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit
     new = replace(

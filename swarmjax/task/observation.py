@@ -139,36 +139,6 @@ def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float,
     ]
 
 
-def stacked_names(names: Sequence[str], history: int) -> tuple[str, ...]:
-    """Returns the input names of a policy that takes several observations.
-
-    Args:
-      names: [O] names of one observation's entries.
-      history: number of observations, k.
-
-    Returns:
-      [k O] names: unchanged for the current observation, then with a suffix for observations 1, 2,
-      ... control steps ago, as in `target_distance[-1]`.
-    """
-    marks = ["", *(f"[-{age}]" for age in range(1, history))]
-    return tuple(f"{name}{mark}" for mark in marks for name in names)
-
-
-def stack(fresh: Array, before: Array, xp: Any) -> Array:
-    """Adds an observation at the front of the stack of earlier ones, and drops the oldest.
-
-    Args:
-      fresh: [..., O] current observation.
-      before: [..., k O] stack of the previous control step; zeros at the start of an episode.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      [..., k O] newest first.
-    """
-    kept = before.shape[-1] - fresh.shape[-1]
-    return xp.concatenate([fresh, before[..., :kept]], axis=-1) if kept else fresh
-
-
 LAYOUTS = {encoding: layout(encoding) for encoding in get_args(Encoding)}
 NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size

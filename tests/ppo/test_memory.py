@@ -20,7 +20,6 @@ from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO
-from swarmjax.task import observation
 
 STEPS, ROWS, WIDTH, SIZE = 6, 3, 4, 5
 
@@ -143,7 +142,7 @@ def _play(ppo: PPO, state: Any, key: jax.Array, history: int) -> tuple[Batch, ja
     """Plays one episode in each world and returns the batch and the mean reward.
 
     The first step shows a cue of -1 or 1, and the last step rewards an action of the cue's sign.
-    With a `history` above 1, the networks see that many observations, stacked as in an environment.
+    With a `history` above 1, the networks see that many observations, the newest first.
     """
     cue_key, noise_key = jax.random.split(key)
     cue = jax.random.rademacher(cue_key, (_WORLDS,), jnp.float32)
@@ -179,7 +178,7 @@ def _play(ppo: PPO, state: Any, key: jax.Array, history: int) -> tuple[Batch, ja
 
 
 def _stacked(before: jax.Array, fresh: jax.Array) -> tuple[jax.Array, jax.Array]:
-    after = observation.stack(fresh, before, jnp)
+    after = jnp.concatenate([fresh, before], axis=-1)[..., : before.shape[-1]]
     return after, after
 
 

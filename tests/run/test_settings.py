@@ -238,17 +238,10 @@ def test_import_needs_neither_jax_nor_hydra():
          "is [0.4,0.5], too small for every cell of the grid: even the fewest robots and obstacles "
          "need 0.58."),
         (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
-        (["task.history=0"], "task.history is 0: give 1 to 64."),
-        (["task.history=65"], "task.history is 65: give 1 to 64."),
         # Checks across keys.
-        (["task.history=4", "algo.memory=gru"], "task.history is 4, but algo.memory is gru: "
-         "choose one, task.history=1 or algo.memory=none."),
         (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
          "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
-        (["task.neighbours.count=2", "task.history=3"], "task.history is 3, but neighbours.count "
-         "is 2: choose one, history=1 or neighbours.count=0; neighbours work with "
-         "algo.memory=gru."),
         (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
          "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
         (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "

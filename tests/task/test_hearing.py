@@ -147,11 +147,6 @@ def test_robots_that_do_not_hear_observe_as_before() -> None:
         (NeighboursConfig, {"count": 1, "range": 11.0}, "range is 11"),
         (NeighboursConfig, {"count": 33}, "count is 33"),
         (RealismConfig, {"packet_loss": 1.5}, "packet_loss is 1.5"),
-        (
-            TaskConfig,
-            {"history": 2, "neighbours": NeighboursConfig(count=1)},
-            "history is 2, but neighbours.count is 1",
-        ),
     ],
 )
 def test_what_cannot_be_heard_is_refused(section: Any, said: Any, sentence: str) -> None:

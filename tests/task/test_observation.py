@@ -37,29 +37,6 @@ def test_description_is_plain_data_that_says_everything() -> None:
 
 
 @MODULES
-def test_a_stack_has_the_newest_first_and_zeros_for_what_was_not_seen(xp: ModuleType) -> None:
-    stack = xp.zeros((2, 6))
-    looks = [xp.asarray([[1.0, 2.0], [3.0, 4.0]]) + 10 * i for i in range(4)]
-    found = []
-    for fresh in looks:
-        stack = observation.stack(fresh, stack, xp)
-        found.append(stack[1].tolist())
-    assert found == [
-        [3, 4, 0, 0, 0, 0],
-        [13, 14, 3, 4, 0, 0],
-        [23, 24, 13, 14, 3, 4],
-        [33, 34, 23, 24, 13, 14],
-    ]
-    assert observation.stack(looks[0], looks[1], xp) is looks[0]  # a stack of one is its input
-
-
-def test_entries_of_a_stack_say_how_old_they_are() -> None:
-    assert observation.stacked_names(("a", "b"), 1) == ("a", "b")
-    names = observation.stacked_names(("a", "b"), 3)
-    assert names == ("a", "b", "a[-1]", "b[-1]", "a[-2]", "b[-2]")
-
-
-@MODULES
 @pytest.mark.parametrize(
     ("pose", "target", "distance", "bearing"),
     [
