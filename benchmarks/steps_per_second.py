@@ -30,6 +30,7 @@ from jax import Array
 from benchmarks import lines, timing
 from swarmjax import command
 from swarmjax.curriculum.engine import Next, Schedule
+from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch, drive, physics
@@ -143,7 +144,7 @@ def environment(
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    began = replace(arenas, sim=unpack(arenas.sim), recall=None)  # random actions need no memory
+    began = replace(arenas, sim=unpack(arenas.sim), recall=NO_MEMORY)  # random actions need none
     keys = jax.random.split(key, _rollouts(program.config))
     ended, sums = jax.lax.scan(rolled, began, keys)
     packed = jax.vmap(physics.pack)(ended.sim)

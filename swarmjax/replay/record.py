@@ -1,7 +1,7 @@
 """Records episodes step by step from the judge in MuJoCo's C engine. No JAX."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,8 @@ from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.extension import RewardTerm
 from swarmjax.policy import Policy, PolicyError
-from swarmjax.sim import gaps, infrared
-from swarmjax.task import arrival, electronics
+from swarmjax.sim import infrared
+from swarmjax.task import arrival, electronics, reward
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 
@@ -100,55 +100,6 @@ class Frame(NamedTuple):
     arrived: np.ndarray
     contacts: np.ndarray
     action: np.ndarray
-
-
-class Steps(NamedTuple):
-    """The inputs of the reward of control steps, as in `task.reward.Step`; no JAX.
-
-    Attributes:
-      distance_before: [..., R] to the target before the step, m.
-      distance: [..., R] to the target after the step, m.
-      infrared: [..., R, K] ray lengths after the step, m.
-      sensor_range: Range of the sensors, m.
-      arrives: [..., R] whether the robot arrived in this step; with `hold`, whether all did.
-      contact_begins: [..., R, 3] whether a contact of each kind began in this step.
-      touching: [..., R, 3] whether the robot touches something of each kind after the step.
-      outside: [..., R] whether the robot had yet to arrive when the step began; None: no robot had
-        arrived.
-    """
-
-    distance_before: np.ndarray
-    distance: np.ndarray
-    infrared: np.ndarray
-    sensor_range: float
-    arrives: np.ndarray
-    contact_begins: np.ndarray
-    touching: np.ndarray
-    outside: np.ndarray | None = None
-
-
-def terms(steps: Steps, weights: RewardConfig) -> dict[str, np.ndarray]:
-    """Computes the terms of the reward; the first two are those of the paper's equation 3.
-
-    Args:
-      steps: Control steps.
-      weights: Weights of the terms.
-
-    Returns:
-      [..., R] by name: each term times its weight. Terms with weight 0 are left out.
-    """
-    under_way = np.ones(steps.distance.shape) if steps.outside is None else steps.outside
-    unweighted = {
-        "progress": steps.distance_before - steps.distance,
-        "proximity": under_way * (steps.infrared < steps.sensor_range).any(axis=-1),
-        "arrival": steps.arrives,
-        "contact": steps.contact_begins.sum(axis=-1),
-        "robot_contact": steps.contact_begins[..., gaps.KINDS.index("robot")],
-        "touching": steps.touching.any(axis=-1),
-        "step_penalty": under_way,
-    }
-    weighted = {name: getattr(weights, name) * term for name, term in unweighted.items()}
-    return {name: term for name, term in weighted.items() if getattr(weights, name)}
 
 
 def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
@@ -261,7 +212,7 @@ def _cut(
     active, arrives = arrival.drives(task.arrival, before), ~before & frames.arrived[1:]
     if task.arrival == "hold":
         arrives = np.broadcast_to(frames.arrived[1:].all(axis=-1, keepdims=True), before.shape)
-    steps = Steps(
+    steps = reward.Step(
         distance_before=frames.distance[:-1],
         distance=frames.distance[1:],
         infrared=frames.ray[1:],
@@ -271,7 +222,8 @@ def _cut(
         touching=frames.touching[1:],
         outside=~before,
     )
-    earned = terms(steps, earning) | _own(own, steps, frames)
+    measured = replace(earning, path_progress=0.0)  # a replay measures no paths
+    earned = reward.weighted(steps, measured) | _own(own, steps, frames)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
         scene=scene,
@@ -296,7 +248,7 @@ def _since(arrived: np.ndarray) -> np.ndarray:
 
 
 def _own(
-    own: Sequence[tuple[RewardTerm, float]], steps: Steps, frames: Frame
+    own: Sequence[tuple[RewardTerm, float]], steps: reward.Step, frames: Frame
 ) -> dict[str, np.ndarray]:
     """Computes the reward terms of an extension, [N, R] by name."""
     if not own:

@@ -3,19 +3,18 @@
 Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
 To add a built-in term, add a function, a row of `TERMS`, a weight in `RewardConfig` and a test.
 Terms of an extension need no change here; see `swarmjax.extension.reward_term`.
+Training gives JAX arrays and replays give NumPy arrays; the terms use the module of their arrays.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import chex
-import jax.numpy as jnp
-from jax import Array
-
 from swarmjax.extension import RewardTerm
 from swarmjax.sim.dispatch import least, pieces
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task.config import RewardConfig
+
+Array = Any
 
 
 class Step(NamedTuple):
@@ -72,9 +71,9 @@ def path_progress(step: Step) -> Array:
 
 def proximity(step: Step) -> Array:
     """Returns 1 if one or more rays are shorter than the sensor's range (equation 3)."""
-    rays = step.infrared.shape[-1]
-    nearest = least((step.infrared[..., i] for i in pieces(rays, jnp)), step.sensor_range, jnp)
-    return _before_arrival(step, (nearest < step.sensor_range).astype(jnp.float32))
+    xp = step.infrared.__array_namespace__()
+    parts = (step.infrared[..., i] for i in pieces(step.infrared.shape[-1], xp))
+    return _before_arrival(step, least(parts, step.sensor_range, xp) < step.sensor_range)
 
 
 def arrival(step: Step) -> Array:
@@ -82,17 +81,17 @@ def arrival(step: Step) -> Array:
 
     With `task.arrival=hold`, this is the step in which all robots have arrived.
     """
-    return step.arrives.astype(jnp.float32)
+    return _number(step, step.arrives)
 
 
 def contact(step: Step) -> Array:
     """Returns how many contacts of any kind began in this step."""
-    return jnp.sum(step.contact_begins, axis=-1).astype(jnp.float32)
+    return _number(step, step.contact_begins.sum(axis=-1))
 
 
 def robot_contact(step: Step) -> Array:
     """Returns 1 if a contact with another robot began in this step."""
-    return step.contact_begins[..., KINDS.index("robot")].astype(jnp.float32)
+    return _number(step, step.contact_begins[..., KINDS.index("robot")])
 
 
 def touching(step: Step) -> Array:
@@ -100,17 +99,23 @@ def touching(step: Step) -> Array:
 
     `contact` counts a contact only once, however long a robot then leans against a wall.
     """
-    return jnp.any(step.touching, axis=-1).astype(jnp.float32)
+    return _number(step, step.touching.any(axis=-1))
 
 
 def step_penalty(step: Step) -> Array:
     """Returns 1 for every control step that begins before arrival."""
-    return _before_arrival(step, jnp.ones_like(step.distance))
+    xp = step.distance.__array_namespace__()
+    return _before_arrival(step, xp.ones_like(step.distance, dtype=bool))
 
 
-def _before_arrival(step: Step, price: Array) -> Array:
-    """Returns the price [R] of robots that had not arrived, and 0 for all other robots."""
-    return price if step.outside is None else jnp.where(step.outside, price, 0.0)
+def _before_arrival(step: Step, holds: Array) -> Array:
+    """Returns 1 for robots of which something holds and that had not arrived, else 0, [R]."""
+    return _number(step, holds if step.outside is None else holds & step.outside)
+
+
+def _number(step: Step, values: Array) -> Array:
+    """Returns values as numbers of the kind of the distances."""
+    return values.astype(step.distance.dtype)
 
 
 TERMS: dict[str, Callable[[Step], Array]] = {
@@ -125,23 +130,25 @@ TERMS: dict[str, Callable[[Step], Array]] = {
 }
 
 
-def total(step: Step, weights: RewardConfig, own: Sequence[tuple[RewardTerm, float]] = ()) -> Array:
-    """Sums the weighted terms.
+def weighted(
+    step: Step, weights: RewardConfig, own: Sequence[tuple[RewardTerm, float]] = ()
+) -> dict[str, Array]:
+    """Computes the terms of the reward.
 
     Args:
-      step: one control step.
+      step: one control step, or several with leading axes.
       weights: weight of each term; a term of weight 0 is not computed.
       own: terms of an extension with their weights.
 
     Returns:
-      [R] reward.
+      [R] by name: each term times its weight.
     """
-    chex.assert_equal_shape([step.distance_before, step.distance, step.arrives])
-    reward = jnp.zeros_like(step.distance)
-    for name, term in TERMS.items():
-        weight = getattr(weights, name)
-        if weight:
-            reward = reward + weight * term(step)
-    for piece, weight in own:
-        reward = reward + weight * piece.function(step)
-    return reward
+    used = {name: getattr(weights, name) for name in TERMS if getattr(weights, name)}
+    terms = {name: weight * TERMS[name](step) for name, weight in used.items()}
+    return terms | {piece.name: weight * piece.function(step) for piece, weight in own}
+
+
+def total(step: Step, weights: RewardConfig, own: Sequence[tuple[RewardTerm, float]] = ()) -> Array:
+    """Sums the terms of `weighted`, [R]."""
+    nothing = step.distance.__array_namespace__().zeros_like(step.distance)
+    return sum(weighted(step, weights, own).values(), start=nothing)

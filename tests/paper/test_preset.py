@@ -9,7 +9,7 @@ from sentences import refusal
 
 from swarmjax import epuck
 from swarmjax.command import help_text
-from swarmjax.config import build, files, to_dict
+from swarmjax.config import files
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -59,7 +59,6 @@ def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     others = of_gae | of_others | {"update_backend", "network"}  # for speed or extensions
     keys = {f.name for f in dataclasses.fields(AlgoConfig) if not f.metadata["derived"]}
     assert set(given["algo"]) - {"name"} | others == keys
-    assert PAPER.algo.gae_lambda is None
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}
     assert set(given["task"]["reward"]) == rewards
     # The weights of the paper's equation 3.
@@ -114,10 +113,10 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
     [
         (["algo.advantage=monte_carlo", "algo.gae_lambda=0.9"],
          "algo.gae_lambda is 0.9, but advantage is monte_carlo: gae_lambda is an option of gae, so "
-         "give null or advantage=gae."),
+         "give 0.95 or advantage=gae."),
         (["algo.std_floor=0.2"],
          "algo.std_floor is 0.2, but exploration is learned: std_floor is an option of scheduled, "
-         "so give null or exploration=scheduled."),
+         "so give 0.1 or exploration=scheduled."),
         (["algo=paper", "algo.time_out=bootstrap"],
          "algo.time_out is bootstrap, but advantage is monte_carlo: give terminal or leak."),
         (["algo.time_out=leak"],
@@ -138,13 +137,3 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(words: list[str], sentence: str) -> None:
     assert refusal(load_train, words) == sentence
-
-
-def test_options_take_their_defaults_where_they_have_a_meaning() -> None:
-    plain = AlgoConfig()
-    assert (plain.gae_lambda, plain.time_out) == (0.95, "bootstrap")
-    assert (plain.std_decrement, plain.std_interval, plain.std_floor) == (None, None, None)
-    other = AlgoConfig(advantage="monte_carlo", exploration="scheduled")
-    assert (other.gae_lambda, other.time_out) == (None, "terminal")
-    assert (other.std_decrement, other.std_interval, other.std_floor) == (0.05, 250_000, 0.1)
-    assert build(AlgoConfig, to_dict(other)) == other

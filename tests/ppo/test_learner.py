@@ -401,7 +401,7 @@ def test_advantages_may_be_left_as_they_are() -> None:
 
 
 def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:
-    config = replace(ONE_STEP, advantage="monte_carlo", gae_lambda=None, time_out=None)
+    config = replace(ONE_STEP, advantage="monte_carlo", time_out="terminal")
     state = _fresh(config=config)
     batch = _batch(state, 0, config)
     _, metrics = _update(state, batch, jax.random.key(1), config=config)

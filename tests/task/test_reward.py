@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -55,6 +56,17 @@ def test_term_and_its_weight(step: reward.Step, name: str, expected: list[float]
     np.testing.assert_array_equal(reward.TERMS[name](step), expected)
     weights = dataclasses.replace(NOTHING, **{name: -4.0})
     np.testing.assert_array_equal(reward.total(step, weights), -4.0 * np.array(expected))
+
+
+def test_numpy_computes_the_terms_of_jax(step: reward.Step) -> None:
+    """Replays give NumPy arrays; all numbers of `step` are exact in float32."""
+    weights = RewardConfig(**dict.fromkeys(reward.TERMS, -0.5))
+    step = step._replace(outside=jnp.array([True, True, False, True]))
+    told = jax.tree.map(np.asarray, step)._replace(sensor_range=RANGE)
+    terms, expected = reward.weighted(told, weights), reward.weighted(step, weights)
+    for name, term in terms.items():
+        assert isinstance(term, np.ndarray)
+        np.testing.assert_array_equal(term, expected[name], err_msg=name)
 
 
 def test_every_weight_has_its_term() -> None:
