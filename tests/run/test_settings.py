@@ -292,9 +292,9 @@ def test_train_refuses(words, sentence):
          "obstacles of its own: give shape=box."),
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
-        (["algo=ppo"], "algo is not a key: give one of policy, compare, stage, robot, task, suite, "
-         "shape, realism, action, engine, steps, episodes, seed, workers, substeps, extensions, "
-         "out, overwrite."),
+        (["algo=ppo"], "algo is not a key: give one of stage, robot, task, suite, shape, realism, "
+         "action, steps, episodes, seed, workers, substeps, extensions, overwrite, policy, "
+         "compare, engine, out."),
     ],
 )  # fmt: skip
 def test_evaluate_refuses(words, sentence):
