@@ -71,6 +71,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         swarmjax.no_such  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue]
 
 
+@pytest.mark.slow
 def test_arenas_play_the_stages_in_turn(env: Swarm, states: list[SwarmState]) -> None:
     assert (env.num_arenas, env.num_robots) == (ARENAS, 3)
     np.testing.assert_array_equal(states[0].present.sum(axis=1), [2, 3, 2, 3])

@@ -22,6 +22,7 @@ def _run(tmp_path: Path, name: str, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_arenas_are_stepped_at_random_and_drawn(tmp_path: Path) -> None:
     assert _run(tmp_path, "random_arenas.py").startswith("12,800 arena steps, mean reward ")
     assert (tmp_path / "random_arenas.png").read_bytes().startswith(b"\x89PNG")

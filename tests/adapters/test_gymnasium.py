@@ -29,6 +29,7 @@ def closed(swarm: Swarm) -> SwarmVectorEnv:
     return made
 
 
+@pytest.mark.slow
 def test_what_comes_lies_in_the_spaces(envs: SwarmVectorEnv) -> None:
     assert isinstance(envs, gymnasium.vector.VectorEnv)
     assert envs.single_observation_space.shape == (10,)

@@ -43,6 +43,7 @@ def steps(env: SwarmMultiAgentEnv, arena_course: Course) -> list[tuple]:
     return found
 
 
+@pytest.mark.slow
 def test_observations_and_rewards_are_those_of_the_course(
     steps: list, arena_course: Course
 ) -> None:
@@ -110,6 +111,7 @@ def test_spaces_and_classes(env: SwarmMultiAgentEnv) -> None:
     assert not env.action_space("agent_1").contains(action + 2.0)
 
 
+@pytest.mark.slow
 def test_jaxmarls_wrapper_takes_it(env: SwarmMultiAgentEnv) -> None:
     wrapped = LogWrapper(env)
     _, state = wrapped.reset(jax.random.key(0))

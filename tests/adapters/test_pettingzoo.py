@@ -34,6 +34,7 @@ def steps(env: SwarmParallelEnv, arena_course: Course) -> list[tuple]:
     return found
 
 
+@pytest.mark.slow
 def test_the_checker_passes(env: SwarmParallelEnv, capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # the checker reports many faults only as warnings

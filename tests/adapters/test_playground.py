@@ -62,6 +62,7 @@ def test_done_says_that_all_have_arrived(env: SwarmMjxEnv, states: list) -> None
     assert jax.jit(env.step)(state, jnp.zeros(4)).done == 1.0
 
 
+@pytest.mark.slow
 def test_playgrounds_wrapper_ends_episodes_and_draws_new_levels(wrapped: Any) -> None:
     keys = jax.random.split(jax.random.PRNGKey(0), 3)  # Brax's wrappers take only old-style keys
     state, step = jax.jit(wrapped.reset)(keys), jax.jit(wrapped.step)

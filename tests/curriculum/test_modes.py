@@ -291,6 +291,7 @@ SHARES = st.lists(st.one_of(st.just(NAN), st.floats(0.0, 1.0, width=32)), min_si
     floor=st.floats(2.0**-10, 1.0, width=32),
     index=st.integers(0, 3),
 )
+@pytest.mark.slow
 def test_weights_are_shares(fast: list[float], seed: int, floor: float, index: int) -> None:
     count = len(fast)
     options = (SEQUENTIAL, MIXED, ADAPTIVE, FAILURE)[index]

@@ -302,7 +302,11 @@ class Engines(NamedTuple):
 
 @pytest.fixture(
     scope="module",
-    params=[("wheeled", "ideal"), ("planar", "real"), ("wheeled", "real")],
+    params=[
+        pytest.param(("wheeled", "ideal"), marks=pytest.mark.slow),
+        ("planar", "real"),
+        pytest.param(("wheeled", "real"), marks=pytest.mark.slow),
+    ],
     ids="-".join,
 )
 def engines(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Engines:

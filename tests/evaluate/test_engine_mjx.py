@@ -106,6 +106,7 @@ def test_the_engines_of_the_command_agree(
         np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free])
 
 
+@pytest.mark.slow
 def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
     given, told = policies.recalling(_arrays((STEER,)), 6)
     given["actor/mean/kernel"][:, 2:] *= 0.3  # smaller, beside the steering

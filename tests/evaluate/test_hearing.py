@@ -62,7 +62,7 @@ def test_mujoco_and_geometry_agree_on_who_is_hidden(tmp_path: Path) -> None:
     assert 0.1 < found.mean() < 0.9
 
 
-@pytest.mark.parametrize("kind", ["ideal", "real"])
+@pytest.mark.parametrize("kind", [pytest.param("ideal", marks=pytest.mark.slow), "real"])
 def test_both_engines_observe_the_same_neighbours_step_by_step(kind: str, tmp_path: Path) -> None:
     noise: dict[str, Any] = {
         "packet_loss": 0.4,
@@ -94,6 +94,7 @@ def test_both_engines_observe_the_same_neighbours_step_by_step(kind: str, tmp_pa
 
 
 @pytest.mark.parametrize("kind", ["none", "gru"])
+@pytest.mark.slow
 def test_both_engines_come_to_the_same_by_a_policy_that_hears(kind: str, tmp_path: Path) -> None:
     judge = _judge(tmp_path / "policy.npz", kind, steps=10, action="sampled")
     levels = [evaluate_judge.draw_level(judge.stage, judge.spacing, 1, i) for i in range(8)]

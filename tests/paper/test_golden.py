@@ -47,6 +47,7 @@ def test_an_update_is_theirs_in_double_precision(
     assert all(found[name] <= DOUBLE[name] for name in compared), found
 
 
+@pytest.mark.slow
 def test_an_update_is_theirs_in_single_precision() -> None:
     found = errors("terminal", trained=(80,))
     # `params_80` is a relative error in norm. Both bounds are for float32 returns and gradients.

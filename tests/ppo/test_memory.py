@@ -112,6 +112,7 @@ def _minibatch() -> Minibatch:
     )
 
 
+@pytest.mark.slow
 def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
     with jax.enable_x64(True):
         minibatch = jax.tree.map(
@@ -194,6 +195,7 @@ _FIELDS = ("observation", "action", "log_prob", "advantage", "return_", "valid")
         ("none", 1, 0.4, 0.6),
     ],
 )
+@pytest.mark.slow
 def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
     memory: Any, history: int, low: float, high: float
 ) -> None:
@@ -228,6 +230,7 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
     assert low <= float(jnp.mean(success[-10:])) <= high
 
 
+@pytest.mark.slow
 def test_a_memory_that_is_no_number_spoils_nothing() -> None:
     """Gives a robot without valid samples a memory of NaN, which must change nothing."""
     groups, robots, length = 4, 2, CONFIG.rollout_length

@@ -130,6 +130,7 @@ def _modes(state: LearnerState, *observations: float) -> jax.Array:
     return PPO_.act(state, seen, jnp.zeros_like(seen))[0][:, 0]
 
 
+@pytest.mark.slow
 def test_critic_learns_a_constant() -> None:
     state = _solve(
         Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: 1.0 + 0.0 * draw)
@@ -164,6 +165,7 @@ def test_a_truncated_episode_is_valued_as_if_it_went_on() -> None:
     np.testing.assert_allclose(_values(_solve(probe), 0.0), [2.0], atol=0.01)
 
 
+@pytest.mark.slow
 def test_actor_learns_the_best_action() -> None:
     state = _solve(
         Probe(1, lambda draw, clock: 0.0 * draw, lambda draw, action, clock: -((action - 0.5) ** 2))
@@ -182,6 +184,7 @@ def test_actor_learns_the_best_action_of_each_observation() -> None:
     np.testing.assert_allclose(_modes(state, -1.0, 1.0), [-0.5, 0.5], atol=0.02)
 
 
+@pytest.mark.slow
 def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
     def reward(draw: jax.Array, action: jax.Array, clock: jax.Array) -> jax.Array:
         return -((jnp.clip(action, -1.0, 1.0) - 0.5) ** 2)
@@ -193,6 +196,7 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
     np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.05)
 
 
+@pytest.mark.slow
 def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     interpreted = functools.partial(fused.flat_gradient, interpret=True)
     monkeypatch.setattr(fused, "flat_gradient", interpreted)

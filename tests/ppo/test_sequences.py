@@ -83,7 +83,7 @@ def _samples(batch: Batch) -> Minibatch:
     return ppo._samples(_learner(), CONFIG, batch, ppo.ALONE)
 
 
-@pytest.mark.parametrize("minibatches", [1, 2])
+@pytest.mark.parametrize("minibatches", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int) -> None:
     samples, params = _samples(_batch()), _learner().params
     count = jnp.sum(samples.valid)
@@ -103,6 +103,7 @@ def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int
     chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_learner_learns_as_by_autodiff() -> None:
     found, expected = (
         _update(_learner(), _batch(), CONFIG, name) for name in ("sequences", "autodiff")
@@ -220,6 +221,7 @@ def test_a_minibatch_without_a_sequence_is_no_step() -> None:
     assert float(metrics["grad_norm"]) > 0.0
 
 
+@pytest.mark.slow
 def test_learners_side_by_side_come_to_what_each_does_alone() -> None:
     config = replace(CONFIG, num_minibatches=2, epochs=2)
     ends = (ENDS, np.array([3, 0, 0, 0, 0]))  # the second learner has fewer tiles

@@ -119,6 +119,7 @@ film.close()
 """
 
 
+@pytest.mark.slow
 def test_a_film_shows_the_robots(tmp_path):
     out, found = tmp_path / "film.mp4", tmp_path / "found.npz"
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra video")

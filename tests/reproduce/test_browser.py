@@ -34,6 +34,7 @@ def _open(browser: Any, file: Path, width: int = 1200) -> None:
     browser.get(file.as_uri())
 
 
+@pytest.mark.slow
 def test_it_opens_from_a_file_and_asks_for_nothing_else(browser: Any, file: Path) -> None:
     _open(browser, file)
     seen = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]

@@ -51,6 +51,7 @@ def _said(process: subprocess.Popen[str]) -> tuple[int, str]:
     return process.returncode, errors
 
 
+@pytest.mark.slow
 def test_processes_of_other_settings_are_refused(tmp_path: Path, coordinator: str) -> None:
     run = tmp_path / "run"
     both = [_start(run, coordinator, i, "devices=2", f"seed={i}") for i in range(2)]

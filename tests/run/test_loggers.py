@@ -184,6 +184,7 @@ def test_a_function_that_raises_loses_itself_and_not_the_run(told: Told) -> None
     assert told.said == "swarmjax: log is not written from here on: SystemExit: enough.\n"
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_tells_what_comes_after_its_checkpoint(told: Told) -> None:
     rows: list[dict] = []
     more = {"budget": 16 * 4 * 8, "run.tensorboard": False, "run.wandb": None}

@@ -43,6 +43,7 @@ SLOW = ("grid", "seeds", "paper", "hull", "own")
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOW)) for kind in KINDS]
 )
+@pytest.mark.slow
 def test_the_policy_is_judged_by_the_command_as_printed(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

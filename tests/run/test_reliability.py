@@ -138,6 +138,7 @@ def _kill_while_opening(run: Path, torn: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("torn", ["config.json", "metrics.jsonl"])
+@pytest.mark.slow
 def test_a_resume_that_is_killed_while_it_opens_its_files_loses_nothing(
     torn: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,6 +195,7 @@ def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> No
     assert (run / "episodes.jsonl").read_bytes().startswith(written)
 
 
+@pytest.mark.slow
 def test_a_run_without_arenas_in_its_checkpoints_goes_on_with_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -243,6 +245,7 @@ def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path
 @pytest.mark.parametrize(
     "words", [["run.chunk=1"], pytest.param(["run.chunk=all"], marks=pytest.mark.slow)]
 )
+@pytest.mark.slow
 def test_a_signal_of_a_scheduler_saves_and_asks_for_a_requeue(
     words: list[str], tmp_path: Path
 ) -> None:
@@ -518,6 +521,7 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     assert checkpoint.restore(tmp_path)[1] == 4
 
 
+@pytest.mark.slow
 def test_a_search_for_nan_ends_the_run_at_the_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -552,6 +556,7 @@ def _spoilt(run: Path, monkeypatch: pytest.MonkeyPatch, stop_after: int) -> Path
     return run
 
 
+@pytest.mark.slow
 def test_lower_rates_are_kept_when_the_run_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -562,6 +567,7 @@ def test_lower_rates_are_kept_when_the_run_is_resumed(
     assert checkpoint.find(run).rate_scale == 0.1
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_before_it_has_diverged_does_not_go_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -122,6 +122,7 @@ def test_a_run_says_what_steps_the_robots_and_then_that_it_compiles(
 
 
 @pytest.mark.parametrize("chunk", ["7", "all", "auto"])
+@pytest.mark.slow
 def test_chunks_of_any_size_train_the_same_parameters(
     chunk: str, whole: Path, tmp_path: Path
 ) -> None:
@@ -218,6 +219,7 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
     rows = _rows(several)
     assert [(row["update"], row["seed"]) for row in rows] == [
@@ -368,6 +370,7 @@ def test_what_a_killed_start_leaves_is_no_obstacle(tmp_path: Path) -> None:
     lifecycle.check_free(tmp_path, load_train([*TINY, f"run.dir={tmp_path}"]))
 
 
+@pytest.mark.slow
 def test_a_resumed_run_spares_other_runs_and_what_is_spent(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -395,6 +398,7 @@ def test_foreign_and_missing_runs_are_refused(
     assert "no sound checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_before_it_saved_begins_from_its_seed(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

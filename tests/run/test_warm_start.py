@@ -155,6 +155,7 @@ SCHEDULED = ["algo.exploration=scheduled", "algo.std_interval=30"]
 EXPLORED = "learners/explored"
 
 
+@pytest.mark.slow
 def test_a_schedule_of_exploration_goes_on_unless_it_is_reset(
     trained: Path, tmp_path: Path
 ) -> None:

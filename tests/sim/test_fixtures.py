@@ -187,6 +187,7 @@ def test_what_moves_stops_a_robot_where_it_is_and_no_longer_where_it_was(
     assert np.all(gone[stopped] > CLEAR - 0.003)
 
 
+@pytest.mark.slow
 def test_what_moves_is_met_as_in_c(loaded: physics.Physics) -> None:
     pose, scenes = _scenes()
     found = _drive(loaded, pose, scenes)

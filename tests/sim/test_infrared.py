@@ -441,6 +441,7 @@ def _many_scenes() -> tuple[np.ndarray, ...]:
 
 
 @MODULES
+@pytest.mark.slow
 def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> None:
     pose, box, truth, geom = _many_scenes()
     hits = (truth > 0.0) & (truth < RANGE)

@@ -132,6 +132,7 @@ def test_random_commands_free_of_contact_as_in_c(engine: Engine) -> None:
     _check_close(found, expected)
 
 
+@ONCE_MORE
 def test_contacts_as_in_c(engine: Engine) -> None:
     obstacle = np.array([[0.1, 0.02, 0.5, 0.06, 0.04], [-0.15, -0.12, 1.1, 0.05, 0.05]], np.float32)
     pose = _yaws(2, [(-0.03, -0.05), (0.05, 0.13), (0.0, -0.2)])
@@ -328,6 +329,7 @@ def test_a_lagging_servo_follows_the_closed_form_in_c(body: str) -> None:
 
 
 @ONCE_MORE
+@pytest.mark.slow
 def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     # Ten turns on the spot at 3.14 rad/s take 10 * 2 pi / 3.14 = 20.01 s with the nominal track.
     steps, tracks = round(10 * 2 * np.pi / 3.14 / STEP), np.array([0.052, 0.057, 0.055])

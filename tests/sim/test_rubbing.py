@@ -87,8 +87,11 @@ def _check_jammed(path: Path) -> None:
 CLOSE, CLOSE_YAW = 9e-7, 1.5e-5
 
 
-@pytest.mark.parametrize(("impl", "solver"), [("jax", "swarm"), ("warp", "swarm"), ("warp", "mjx")])
-@pytest.mark.parametrize("friction", [0.3, 1.0])
+@pytest.mark.parametrize(
+    ("impl", "solver"),
+    [("jax", "swarm"), ("warp", "swarm"), pytest.param("warp", "mjx", marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize("friction", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_jams_of_planar_robots_as_in_c(impl: Impl, solver: Solver, friction: float) -> None:
     robot = RobotConfig(hull_friction=friction)
     pose, command = _jams()
@@ -101,6 +104,7 @@ def test_jams_of_planar_robots_as_in_c(impl: Impl, solver: Solver, friction: flo
     assert apart[2] <= CLOSE_YAW
 
 
+@pytest.mark.slow
 def test_jams_of_wheeled_robots_as_in_c() -> None:
     robot = RobotConfig(body="wheeled", hull_friction=0.5)
     pose, command = _jams()

@@ -132,7 +132,13 @@ JAMS = {
 }
 
 
-@pytest.mark.parametrize(("impl", "body", "solver"), JAMS)
+@pytest.mark.parametrize(
+    ("impl", "body", "solver"),
+    [
+        pytest.param(*case, marks=[pytest.mark.slow] * (case[1:] == ("wheeled", "mjx")))
+        for case in JAMS
+    ],
+)
 def test_robots_jam_in_a_doorway_as_in_c(impl: Impl, body: BodyName, solver: Solver) -> None:
     pose, wheels = _jams()
     # Warp looks for contacts only within the size of the largest box in the stages, so this stage
@@ -167,7 +173,11 @@ def _jams() -> tuple[np.ndarray, np.ndarray]:
 PAIRS = {0.16: 9, 0.5: 2}  # the fullest arena has this many touching pairs or more, by side in m
 
 
-@pytest.mark.parametrize(("impl", "body", "solver", "side"), CROWDS)
+# MJX is the reference, and compiles longest.
+@pytest.mark.parametrize(
+    ("impl", "body", "solver", "side"),
+    [pytest.param(*case, marks=[pytest.mark.slow] * (case[2] == "mjx")) for case in CROWDS],
+)
 def test_crowds_push_each_other_apart_as_in_c(
     impl: Impl,
     body: BodyName,
@@ -199,6 +209,7 @@ RUBBING = {
 
 
 @pytest.mark.parametrize(("impl", "solver", "side"), RUBBING)
+@pytest.mark.slow
 def test_crowds_that_rub_push_each_other_apart_as_in_c(
     impl: Impl, solver: Solver, side: float
 ) -> None:

@@ -26,7 +26,10 @@ rooms = tuple(f"swarmjax.{room}" for room in ("ppo", "curriculum", "training", "
 print(sorted(name for name in sys.modules if name.startswith(rooms)))
 """
 
+import pytest
 
+
+@pytest.mark.slow
 def test_an_arena_steps_without_any_other_room() -> None:
     done = subprocess.run(
         [sys.executable, "-c", ALONE], capture_output=True, text=True, check=False

@@ -91,7 +91,13 @@ def test_a_robot_without_a_path_keeps_its_distance() -> None:
     assert float(later.distance[0]) == pytest.approx(0.6, abs=ROUND)
 
 
-@pytest.fixture(scope="module", params=["trap", "fence", "maze", "clutter"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        "trap",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("fence", "maze", "clutter")),
+    ],
+)
 def drawn(request: pytest.FixtureRequest) -> Level:
     """Returns thirty levels of one family of stages."""
     settings = load_train([f"stage=world_{request.param}", "arenas=8"])
@@ -150,6 +156,7 @@ def _waypoint(drawn: Level) -> np.ndarray:
     return np.asarray(geodesic.waypoint(path, drawn.start[:, :2], drawn))[0]
 
 
+@pytest.mark.slow
 def test_a_step_towards_the_waypoint_shortens_the_path_by_at_least_as_much(drawn: Level) -> None:
     drawn = jax.tree.map(jnp.asarray, drawn)
     path = jax.jit(jax.vmap(partial(geodesic.begin, hull_radius=HULL)))(drawn)

@@ -361,6 +361,7 @@ def _is_cut_off_by_one(drawn: Level, stage: StageConfig, index: int, robot: int)
     )
 
 
+@pytest.mark.slow
 def test_every_target_stays_reachable_in_any_order_of_arrival(
     stage: StageConfig, drawn: Level
 ) -> None:

@@ -191,6 +191,7 @@ def test_robots_stay_in_their_areas(letter: str, field: str) -> None:
         assert off.max() <= 0.06 + ROUNDING
 
 
+@pytest.mark.slow
 def test_nothing_touches_at_the_start() -> None:
     wall = _cells(ROOMS, "#")
     for drawn in _draw(_stage(ROOMS, 3), 1000):
@@ -203,6 +204,7 @@ def test_nothing_touches_at_the_start() -> None:
         assert arrived.min() > REACH
 
 
+@pytest.mark.slow
 def test_every_open_point_is_used() -> None:
     arrays = task_stage.single(_stage("S..T", 1, cell=0.2)).map
     assert arrays is not None

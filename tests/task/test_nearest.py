@@ -19,6 +19,7 @@ DISTANCES = arrays.arrays(
 
 
 @given(DISTANCES, st.data())
+@pytest.mark.slow
 def test_it_is_that_of_a_stable_sort(distance: np.ndarray, data: st.DataObject) -> None:
     count = data.draw(st.integers(1, distance.shape[1]))
     expected = np.argsort(distance, axis=-1, stable=True)[:, :count]

@@ -38,6 +38,7 @@ def states(tiny_config: TrainConfig, tiny_world: World) -> tuple[TrainState, Tra
     return before, jax.jit(partial(loop.draw_arenas, program))(schedule, without)
 
 
+@pytest.mark.slow
 def test_learners_and_updates_stay(states: tuple[TrainState, TrainState]) -> None:
     before, after = map(to_leaves, states)
     for name in before:

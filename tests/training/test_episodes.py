@@ -141,6 +141,7 @@ def whole(train_for: Train, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_sums_over_episodes_are_the_metrics(whole: Path) -> None:
     rows, metrics = _lines(whole / "episodes.jsonl"), _lines(whole / "metrics.jsonl")
     assert [each["update"] for each in metrics] == list(range(6))

@@ -57,6 +57,7 @@ def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
     return Run(*jax.tree.map(np.asarray, (trajectory, ended)))
 
 
+@pytest.mark.slow
 def test_all_there_ends_the_episode_without_bootstrap(run: Run) -> None:
     found = run.trajectory
     assert found.terminated[0, 0, ALL].tolist() == [True, True, False]

@@ -54,7 +54,9 @@ def _config(base: TrainConfig, mode: str) -> TrainConfig:
     return replace(base, curriculum=curriculum)
 
 
-@pytest.fixture(scope="module", params=["learnability", "value_loss"])
+@pytest.fixture(
+    scope="module", params=["learnability", pytest.param("value_loss", marks=pytest.mark.slow)]
+)
 def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained:
     program, schedule = programs.load(_config(tiny_config, request.param))
     traces = itertools.count(1)
@@ -74,7 +76,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     return Trained(program, schedule, jitted, states, rows)
 
 
-@pytest.mark.parametrize("sizes", [[20], [7, 7, 6]])
+@pytest.mark.parametrize("sizes", [[20], pytest.param([7, 7, 6], marks=pytest.mark.slow)])
 def test_any_chunk_size_gives_the_same_run_bit_for_bit(sizes: list[int], trained: Trained) -> None:
     state = trained.states[0]
     for n in sizes:

@@ -59,7 +59,7 @@ def _run(chunk: Chunk, schedule: Schedule, state: TrainState, sizes: list[int]) 
     return state
 
 
-@pytest.mark.parametrize("sizes", [[7, 7, 6], [20], [1, 19]])
+@pytest.mark.parametrize("sizes", [[7, 7, 6], pytest.param([20], marks=pytest.mark.slow)])
 def test_any_chunk_size_gives_the_same_run_bit_for_bit(
     sizes: list[int], program: Program, start: Callable[[], TrainState], chunk: Chunk
 ) -> None:
@@ -264,6 +264,7 @@ def independent(tiny_config: TrainConfig, tiny_world: World) -> Independent:
     return lambda: init(schedule), jax.jit(partial(loop.train_chunk, program, schedule))
 
 
+@pytest.mark.slow
 def test_independent_robots_learn_apart(independent: Independent) -> None:
     """The third robot is absent from the first stage: its learner must not move at all."""
     start, train = independent
@@ -275,6 +276,7 @@ def test_independent_robots_learn_apart(independent: Independent) -> None:
     assert not np.array_equal(to_leaves(after)[name][0], to_leaves(after)[name][1])
 
 
+@pytest.mark.slow
 def test_newcomers_start_from_what_the_others_learned(independent: Independent) -> None:
     """The deadline comes after ten updates, which is half of the run."""
     start, train = independent

@@ -453,6 +453,7 @@ def test_a_run_may_choose_how_many_episodes_are_drawn(tiny_config: TrainConfig) 
     assert dataclasses.replace(tiny_config, levels_per_rollout=3).waiting == 3
 
 
+@pytest.mark.slow
 def test_episodes_that_wait_are_begun_in_turn_and_all_count(
     program: Program, run: Run, draw: Draw
 ) -> None:

@@ -106,6 +106,7 @@ def test_a_broken_seed_leaves_the_others_alone(start: TrainState, run: Run) -> N
         _assert_same(_lane(found, lane), _lane(expected, lane))
 
 
+@pytest.mark.slow
 def test_a_seed_begins_alike_wherever_it_stands(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState
 ) -> None:

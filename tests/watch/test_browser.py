@@ -97,6 +97,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
 
 
 @chromium.needed
+@pytest.mark.slow
 def test_it_says_when_its_server_is_gone(browser: Any, views: Views) -> None:
     with Server(0, views) as gone:
         thread = threading.Thread(target=gone.serve_forever, daemon=True)

@@ -76,6 +76,7 @@ def test_a_connection_that_sends_slowly_is_closed(
     raise AssertionError
 
 
+@pytest.mark.slow
 def test_too_many_connections_are_closed_at_once(server: Server) -> None:
     address, most = ("127.0.0.1", server.server_port), watch_server._MOST
     with contextlib.ExitStack() as held:
@@ -191,6 +192,7 @@ def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None
     assert "success" in state["figures"]["names"]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)])
     views = Views(WatchConfig(run=str(run)))

@@ -88,6 +88,7 @@ def test_a_learner_learns_as_by_autodiff() -> None:
     assert max(jax.tree.leaves(moved)) > 1e-3
 
 
+@pytest.mark.slow
 def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
     shares = (1.0, 0.3, 0.0)
     batches = [_to_batch(_batch(share, seed)) for seed, share in enumerate(shares)]

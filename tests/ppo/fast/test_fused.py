@@ -259,6 +259,7 @@ def _assert_learned_alike(found: Any, expected: Any) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -319,6 +320,7 @@ def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.Mon
     chex.assert_trees_all_equal((params, state), still[:2])
 
 
+@pytest.mark.slow
 def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(SMALL, num_minibatches=2, epochs=2)
     _interpret(monkeypatch)
@@ -342,6 +344,7 @@ def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.Monk
 @hypothesis.given(
     samples=st.integers(1, 700), share=st.floats(0.0, 1.0), minibatches=st.integers(1, 9)
 )
+@pytest.mark.slow
 def test_tiles_with_valid_samples_are_dealt_out_once_a_pass(
     samples: int, share: float, minibatches: int
 ) -> None:
