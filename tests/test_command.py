@@ -114,14 +114,18 @@ def _shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("line", "code", "error"),
     [
-        ("$RUN.report --help all | true; exit ${PIPESTATUS[0]}", 0, ""),
-        ("$RUN.report --help all >&-", 0, ""),
+        pytest.param(
+            "$RUN.report --help all | true; exit ${PIPESTATUS[0]}", 0, "", marks=pytest.mark.slow
+        ),
+        pytest.param("$RUN.report --help all >&-", 0, "", marks=pytest.mark.slow),
         ("$RUN.report --help all >/dev/full", 1, "swarmjax.report: error: standard output cannot"),
-        ("$RUN.report run=run | true; exit ${PIPESTATUS[0]}", 0, ""),
+        pytest.param(
+            "$RUN.report run=run | true; exit ${PIPESTATUS[0]}", 0, "", marks=pytest.mark.slow
+        ),
         ("$RUN.report run=run >&-", 0, ""),
         ("$RUN.report run=run >/dev/full", 1, "swarmjax.report: error: standard output cannot be"),
-        ("$RUN.report rum=run 2>&-", 2, ""),
-        ("$RUN.report rum=run 2>/dev/full", 2, ""),
+        pytest.param("$RUN.report rum=run 2>&-", 2, "", marks=pytest.mark.slow),
+        pytest.param("$RUN.report rum=run 2>/dev/full", 2, "", marks=pytest.mark.slow),
         ("$RUN.report rum=run >&- 2>&-", 2, ""),
     ],
 )

@@ -39,6 +39,7 @@ def config() -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
     program, schedule = programs.load(config)
     traces = []

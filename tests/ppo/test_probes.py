@@ -139,6 +139,7 @@ def test_critic_learns_a_constant() -> None:
     np.testing.assert_allclose(_values(state, 0.0), [1.0], atol=0.01)
 
 
+@pytest.mark.slow
 def test_critic_learns_from_the_observation() -> None:
     state = _solve(Probe(1, lambda draw, clock: draw, lambda draw, action, clock: draw))
     # The targets are exact, so only Adam's last, shrinking steps leave an error.

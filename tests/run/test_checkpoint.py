@@ -113,6 +113,7 @@ def test_another_run_is_refused_with_both_shapes() -> None:
         checkpoint.from_leaves(leaves, jax.eval_shape(lambda: _state(0.0)))
 
 
+@pytest.mark.slow
 def test_a_seed_is_taken_out_of_a_run() -> None:
     leaves = {"update": np.array([4, 4]), "weights": np.arange(6.0).reshape(2, 3)}
     mine = checkpoint.of_seed(leaves, 1, seeds=2)
@@ -124,7 +125,7 @@ def test_a_seed_is_taken_out_of_a_run() -> None:
         checkpoint.of_seed({"update": np.int32(4)}, 0, seeds=1)
 
 
-@pytest.mark.parametrize("sound", [0, 1])
+@pytest.mark.parametrize("sound", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
     """Orbax by itself refuses to save a step before its newest step, or a step twice."""
     _save(tmp_path, sound, 5)
@@ -213,6 +214,7 @@ def test_a_checkpoint_of_an_older_version_loads_with_a_sentence(tmp_path: Path) 
     assert kept.notes == [f"checkpoint 1 of {tmp_path} does not record its run"]
 
 
+@pytest.mark.slow
 def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         for update, score in ((1, 0.5), (2, 0.9), (3, 0.7), (4, None)):
@@ -220,6 +222,7 @@ def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
     assert checkpoint.steps(tmp_path) == [4, 2]
 
 
+@pytest.mark.slow
 def test_the_bytes_of_the_logs_come_back(tmp_path: Path) -> None:
     with Checkpoints(tmp_path, keep=1) as checkpoints:
         checkpoints.save(_state(1.0), 1, {"metrics.jsonl": 17}, rate_scale=0.1)
@@ -277,6 +280,7 @@ except checkpoint.CheckpointError as error:
 
 
 @pytest.mark.parametrize("damaged", [[2], [1, 2]])
+@pytest.mark.slow
 def test_orbax_says_nothing_beside_our_sentence(tmp_path: Path, damaged: list[int]) -> None:
     _save(tmp_path, 1, 2)
     for update in damaged:

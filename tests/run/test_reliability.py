@@ -95,6 +95,7 @@ def _wait_for(path: Path) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_the_first_checkpoint_comes_before_the_first_update(tmp_path: Path) -> None:
     _stopped(tmp_path / "run", after=1)
     assert checkpoint.steps(tmp_path / "run") == [1, 0]
@@ -178,6 +179,7 @@ def test_rows_after_the_checkpoint_are_not_doubled(whole: Path, tmp_path: Path) 
     assert _digest(run) == _digest(whole)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_elsewhere_has_a_checkpoint_there_at_once(tmp_path: Path) -> None:
     run, on = _stopped(tmp_path / "run", after=5), tmp_path / "on"
     assert train.main([f"resume={run}", f"run.dir={on}", "run.stop_after=5"]) == 0
@@ -234,6 +236,7 @@ def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
     assert set(found) == {row["update"] for row in log if row["budget"] == 160} & set(range(1, 10))
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
     assert train.main([f"resume={run}", f"run.dir={tmp_path / 'on'}"]) == 0
@@ -308,7 +311,9 @@ def _full(monkeypatch: pytest.MonkeyPatch, after: int) -> None:
     monkeypatch.setattr(directory.Log, "write", until_full)
 
 
-@pytest.mark.parametrize("after", [0, 1, 2, 9])
+@pytest.mark.parametrize(
+    "after", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 2, 9))]
+)
 def test_a_full_disk_is_one_sentence_and_the_run_goes_on_later(
     after: int,
     whole: Path,
@@ -338,6 +343,7 @@ def test_auto_begins_and_then_goes_on(whole: Path, tmp_path: Path) -> None:
     assert _updates(tmp_path) == list(range(9))
 
 
+@pytest.mark.slow
 def test_auto_takes_a_larger_budget(tmp_path: Path) -> None:
     words = [*TINY, f"run.dir={tmp_path}", "resume=auto"]
     assert train.main(words) == 0

@@ -456,6 +456,7 @@ def test_a_dry_run_compiles_and_leaves_nothing(
     assert not run.exists()
 
 
+@pytest.mark.slow
 def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     """Interrupts a process long before it has spent its budget of a million updates."""
     words = [*TINY, f"budget={4 * 4 * 10**6}", f"run.dir={tmp_path}", "run.chunk=1"]

@@ -223,6 +223,7 @@ def test_any_other_number_of_seeds_is_refused(
     )
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_passed_over_and_said(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -295,6 +296,7 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
         ),
     ],
 )
+@pytest.mark.slow
 def test_other_networks_are_refused(
     words: list[str],
     what: str,

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 ALONE = """
 import sys
 import jax
@@ -25,8 +27,6 @@ assert after.clock == 1 and bool(came.sound)
 rooms = tuple(f"swarmjax.{room}" for room in ("ppo", "curriculum", "training", "run", "evaluate"))
 print(sorted(name for name in sys.modules if name.startswith(rooms)))
 """
-
-import pytest
 
 
 @pytest.mark.slow

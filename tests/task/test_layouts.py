@@ -117,7 +117,9 @@ def _assert_same_bits(name: str, count: int) -> None:
             np.testing.assert_array_equal(mine[number], theirs)
 
 
-@pytest.mark.parametrize("far", [False, True], ids=["near", "far"])
+@pytest.mark.parametrize(
+    "far", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["near", "far"]
+)
 @pytest.mark.parametrize("name", sorted(LAYOUTS.keys() - {"crowd", "circle"}))
 def test_a_plan_shows_that_every_level_can_be_solved(name: str, *, far: bool) -> None:
     for drawn in _levels(name, far=far)[:5]:

@@ -71,7 +71,14 @@ def levels(draw: Draw) -> dict[str, Level]:
     }
 
 
-@pytest.fixture(params=STAGES, ids=NAMES)
+# Each stage is compiled on its own, so only the smallest and the largest are not slow.
+@pytest.fixture(
+    params=[
+        pytest.param(stage, marks=[pytest.mark.slow] * (stage.name in NAMES[1:6]))
+        for stage in STAGES
+    ],
+    ids=NAMES,
+)
 def stage(request: pytest.FixtureRequest) -> StageConfig:
     return request.param
 

@@ -31,8 +31,6 @@ from swarmjax.training import program as programs
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
 
-UPDATES = 3
-
 
 class Trained(NamedTuple):
     """A run after three updates, and its next rollout, in which episodes end."""

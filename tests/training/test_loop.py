@@ -144,6 +144,7 @@ def _six(base: TrainConfig, options: CurriculumConfig) -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainConfig) -> None:
     """Promotes by deadline, since nothing is learned in so few updates."""
     options = CurriculumConfig(mode="sequential", threshold=1.0, budget_share=0.8)

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow  # each run compiles in a process of its own
+
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("two_devices.py")
 
@@ -42,7 +44,7 @@ def _end(*processes: subprocess.Popen[str]) -> None:
 
 @pytest.fixture(
     scope="module",
-    params=[PLAIN, *(pytest.param(each, marks=pytest.mark.slow) for each in (REMEMBERS, LEVELS))],
+    params=[PLAIN, REMEMBERS, LEVELS],
     ids=["plain", "remembers", "levels"],
 )
 def words(request: pytest.FixtureRequest) -> str:
@@ -58,9 +60,7 @@ def alone(words: str, tmp_path_factory: pytest.TempPathFactory) -> Found:
     return dict(np.load(out))
 
 
-@pytest.fixture(
-    scope="module", params=["one process", pytest.param("two processes", marks=pytest.mark.slow)]
-)
+@pytest.fixture(scope="module", params=["one process", "two processes"])
 def spread(
     request: pytest.FixtureRequest, words: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Found:

@@ -63,6 +63,7 @@ def _ask(
     return found
 
 
+@pytest.mark.slow
 def test_a_connection_that_sends_slowly_is_closed(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,6 +164,7 @@ def test_the_name_of_a_run_is_text(server: Server) -> None:
     assert "a <b>" not in content
 
 
+@pytest.mark.slow
 def test_a_line_that_is_half_written_is_left_out(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0), row(1)])
     with (run / "metrics.jsonl").open("a") as file:

@@ -272,6 +272,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     assert len(calls) == 1  # traced once, inside a loop over the steps
 
 
+@pytest.mark.slow
 def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -305,6 +306,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     _assert_learned_alike(found, (*progress, means))
 
 
+@pytest.mark.slow
 def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(SMALL, num_minibatches=4, epochs=3)
     begun = _ppo(config).init(jax.random.key(0))
