@@ -171,6 +171,7 @@ def test_a_damaged_cell_is_refused_in_one_sentence(
 @pytest.mark.parametrize(
     ("typed", "limits"), [([], [1500, 70]), (["steps=40"], [40, 40])], ids=["cell", "typed"]
 )
+@pytest.mark.slow
 def test_a_cell_has_a_step_limit_of_its_own(
     words: list[str], monkeypatch: pytest.MonkeyPatch, typed: list[str], limits: list[int]
 ) -> None:

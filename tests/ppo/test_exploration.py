@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import learners
 import numpy as np
+import pytest
 
 from swarmjax.ppo import exploration
 from swarmjax.ppo.batch import Batch
@@ -76,6 +77,7 @@ def test_without_a_schedule_a_learner_stays_as_it_is() -> None:
     assert made.explore(state, 10) is state
 
 
+@pytest.mark.slow
 def test_an_update_leaves_a_scheduled_deviation_alone() -> None:
     state = PPO_.explore(PPO_.init(jax.random.key(0)), 150)
     observation, action = jax.random.normal(jax.random.key(1), (2, 4, 6, 3))

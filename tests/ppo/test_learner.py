@@ -294,6 +294,7 @@ def test_same_inputs_give_the_same_bits_and_another_key_does_not() -> None:
     assert np.any(other.params["actor"]["log_std"] != first[0].params["actor"]["log_std"])
 
 
+@pytest.mark.slow
 def test_any_split_of_a_compiled_loop_gives_the_same_bits() -> None:
     traces = []
 
@@ -314,6 +315,7 @@ def test_any_split_of_a_compiled_loop_gives_the_same_bits() -> None:
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_learners_under_vmap_equal_single_ones() -> None:
     states = [_experienced(seed) for seed in range(3)]
     batches = [_batch(state, seed) for seed, state in enumerate(states)]
@@ -380,6 +382,7 @@ def test_adam_takes_its_epsilon_from_the_config() -> None:
     assert move < 0.5 * rate
 
 
+@pytest.mark.slow
 def test_observations_may_be_left_as_they_are() -> None:
     config = replace(ONE_STEP, normalize_observations=False)
     state = _fresh(config=config)
@@ -389,6 +392,7 @@ def test_observations_may_be_left_as_they_are() -> None:
     np.testing.assert_array_equal(ppo.normalize(updated, seen), seen)
 
 
+@pytest.mark.slow
 def test_advantages_may_be_left_as_they_are() -> None:
     config = replace(ONE_STEP, normalize_advantages=False, max_grad_norm=None, bound_cost=0.0)
     state = _fresh(config=config)

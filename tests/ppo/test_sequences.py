@@ -208,6 +208,7 @@ def test_a_batch_of_nothing_valid_is_no_step() -> None:
     assert float(metrics["grad_norm"]) == 0.0
 
 
+@pytest.mark.slow
 def test_a_minibatch_without_a_sequence_is_no_step() -> None:
     config = replace(CONFIG, num_minibatches=4, epochs=3)
     batch = _batch()

@@ -136,6 +136,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 @chromium.needed
+@pytest.mark.slow
 def test_the_page_says_who_is_within_its_target(
     browser: Any, recordings: list[Recording], policy: Path, tmp_path: Path
 ) -> None:

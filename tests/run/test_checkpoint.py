@@ -53,6 +53,7 @@ def test_a_state_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert jax.random.key_data(state["key"]).tolist() == [0, 5]
 
 
+@pytest.mark.slow
 def test_the_newest_are_kept_and_any_of_them_can_be_asked_for(tmp_path: Path) -> None:
     _save(tmp_path, 1, 2, 3)
     assert checkpoint.restore(tmp_path)[1] == 3
@@ -126,6 +127,7 @@ def test_a_seed_is_taken_out_of_a_run() -> None:
 
 
 @pytest.mark.parametrize("sound", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
     """Orbax by itself refuses to save a step before its newest step, or a step twice."""
     _save(tmp_path, sound, 5)
@@ -159,6 +161,7 @@ def test_a_renamed_checkpoint_is_passed_over(tmp_path: Path) -> None:
     assert "it belongs to update 2" in skipped[0]
 
 
+@pytest.mark.slow
 def test_swapped_checkpoints_are_both_passed_over(tmp_path: Path) -> None:
     _save(tmp_path, 1, 2)
     (_steps(tmp_path) / "2").rename(_steps(tmp_path) / "3")

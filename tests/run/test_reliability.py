@@ -217,6 +217,7 @@ def test_checkpoints_without_their_config_are_not_added_to(tmp_path: Path) -> No
         train.main([*TINY, f"run.dir={run}"])
 
 
+@pytest.mark.slow
 def test_damaged_rows_of_a_run_that_goes_on_are_one_sentence(tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
     log = run / "metrics.jsonl"
@@ -335,6 +336,7 @@ def test_a_full_disk_is_one_sentence_and_the_run_goes_on_later(
 # To resume a run, or to begin one
 
 
+@pytest.mark.slow
 def test_auto_begins_and_then_goes_on(whole: Path, tmp_path: Path) -> None:
     words = [*TINY, f"run.dir={tmp_path}", "resume=auto"]
     assert train.main([*words, "run.stop_after=4"]) == 0
@@ -384,6 +386,7 @@ def test_a_log_that_was_cut_is_refused_with_what_to_do(lost: str, tmp_path: Path
     assert _updates(run) == list(range(5, 9))
 
 
+@pytest.mark.slow
 def test_a_run_whose_directory_vanishes_still_writes_its_policy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

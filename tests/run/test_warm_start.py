@@ -396,6 +396,7 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
         (["init_from="], "init_from is '': give text or null."),
     ],
 )
+@pytest.mark.slow
 def test_keys_that_do_not_fit_together_are_refused(
     words: list[str],
     sentence: str,

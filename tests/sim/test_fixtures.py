@@ -171,6 +171,7 @@ def _arena(scenes: Scenes, arena: int) -> Scenes:
     return Scenes(*(each[:, arena] for each in scenes))
 
 
+@pytest.mark.slow
 def test_what_moves_stops_a_robot_where_it_is_and_no_longer_where_it_was(
     loaded: physics.Physics,
 ) -> None:

@@ -345,6 +345,7 @@ def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
 
 
 @ONCE_MORE
+@pytest.mark.slow
 def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
     """Compares mass, friction, wheels and track set at run time with a model built with them."""
     robot = dataclasses.replace(
@@ -377,7 +378,9 @@ def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
     _check_close(drive_all(engine, pose, wheels, obstacle, chassis=chassis), expected)
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.6, np.pi / 4])
+@pytest.mark.parametrize(
+    "yaw", [0.6, *(pytest.param(yaw, marks=pytest.mark.slow) for yaw in (0.0, np.pi / 4))]
+)
 def test_a_robot_driven_into_a_wall_stays_inside(engine: Engine, yaw: float) -> None:
     # Robots start half a millimetre apart from arena to arena, so that one of them just misses the
     # wall at the end of a step.

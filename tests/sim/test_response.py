@@ -20,7 +20,10 @@ from swarmjax.sim.response import REACH, Wear
 
 RADIUS = 0.037  # m
 TILT = math.cos(0.16)
-MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+# One text computes both. JAX compiles each shape anew, so only the comparisons below take it.
+MODULES = pytest.mark.parametrize(
+    "xp", [np, pytest.param(jnp, marks=pytest.mark.slow)], ids=["numpy", "jax"]
+)
 RESPONSES = pytest.mark.parametrize("name", ["webots", "real"])
 NO_BOX = np.zeros((0, 5), np.float32)
 # Float32 rounds counts of up to 4095 by 2.4e-4. Float32 rounds lengths of up to 0.07 m by 4e-9 m,

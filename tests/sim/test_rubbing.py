@@ -189,6 +189,7 @@ def test_a_robot_slides_along_a_wall_by_coulombs_law(
 
 
 @pytest.mark.parametrize("impl", ["jax", "warp"])
+@pytest.mark.slow
 def test_an_episode_may_have_a_friction_of_its_own(impl: Impl) -> None:
     pose, command = _jams()
     wheels = np.broadcast_to(wheels_of(command), (20, ARENAS, ROBOTS, 2))

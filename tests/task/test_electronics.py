@@ -24,7 +24,10 @@ from swarmjax.task.config import TaskConfig
 from swarmjax.task.electronics import Electronics, Memory, Sight
 from swarmjax.task.factors import Factors
 
-MODULES = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
+# One text computes both. JAX compiles each shape anew, so only the comparisons below take it.
+MODULES = pytest.mark.parametrize(
+    "xp", [np, pytest.param(jnp, marks=pytest.mark.slow)], ids=["numpy", "jax"]
+)
 ENCODINGS = pytest.mark.parametrize("encoding", ["metric", "webots"])
 RESPONSES = pytest.mark.parametrize("kind", ["ideal", "webots", "real"])
 Encoding = Literal["metric", "webots"]

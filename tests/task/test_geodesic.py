@@ -215,6 +215,7 @@ def test_an_arena_keeps_the_path_from_where_its_robot_is(driven: Driven) -> None
     assert float(driven.ended.path.distance[0]) == pytest.approx(_distance(drawn), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_critic_of_the_state_sees_how_long_the_path_is(driven: Driven) -> None:
     assert driven.ended.path is not None
     seen = env.look_around(driven.world, driven.ended)

@@ -19,7 +19,7 @@ from swarmjax.task.config import NeighboursConfig, TaskConfig
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 
-XPS = [np, jnp]
+XPS = [np, pytest.param(jnp, marks=pytest.mark.slow)]
 NOBODY = np.array([[9.0, 9.0, 0.0, 0.1, 0.1]], np.float32)
 # Robot 0 is in the middle and faces north. The others are 0.3 m north, 0.4 m east and 0.8 m west.
 POSE = np.array([[0, 0, np.pi / 2], [0, 0.3, 0], [0.4, 0, 0], [-0.8, 0, 0]], np.float32)

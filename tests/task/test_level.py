@@ -396,6 +396,7 @@ ROOMS = st.floats(0.0, 1.0, allow_subnormal=False)
     room=ROOMS,
     seed=st.integers(0, 2**32 - 1),
 )
+@pytest.mark.slow
 def test_nothing_overlaps_on_any_stage_that_is_accepted(
     draw: Draw, robots: int, obstacles: int, size: float, room: float, seed: int
 ) -> None:

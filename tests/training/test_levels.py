@@ -26,6 +26,7 @@ from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
 UPDATES = 20
+pytestmark = pytest.mark.slow  # a run of the whole program; tests/curriculum has the rules
 
 
 class Trained(NamedTuple):

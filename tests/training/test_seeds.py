@@ -147,6 +147,7 @@ def test_one_seed_is_what_the_loop_makes(
         np.testing.assert_allclose(lane, leaf, rtol=0.0, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.slow
 def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> None:
     """Ends a cohort with made-up counts: the seeds reach all, half and none of 10 targets."""
     stages, cohort, threshold = 2, 2, 0.8

@@ -75,6 +75,7 @@ def test_valid_samples_come_first_in_their_order() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_learner_learns_as_by_autodiff() -> None:
     begun = PPO_.init(jax.random.key(0))
     batch = _to_batch(_batch(0.5))

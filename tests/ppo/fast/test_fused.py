@@ -109,7 +109,9 @@ def _assert_close(found: Any, expected: Any) -> None:
     [
         # Seven tiles for three programs: two programs have no tile left in the last round. The
         # last tile holds 8 samples.
-        ({"hidden_sizes": (64, 64)}, Launch(32, 3, 4), 200, 140.0),
+        pytest.param(
+            {"hidden_sizes": (64, 64)}, Launch(32, 3, 4), 200, 140.0, marks=pytest.mark.slow
+        ),
         ({"hidden_sizes": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
         ({"hidden_sizes": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
         ({"exploration": "scheduled"}, Launch(64, 1, 4), 65, 40.0),
@@ -160,7 +162,7 @@ def _several(*lead: int) -> tuple[Params, Minibatch, jax.Array]:
     return *stacked, 20.0 + jnp.arange(number, dtype=jnp.float32).reshape(lead)
 
 
-@pytest.mark.parametrize("lead", [(3,), (2, 2)])
+@pytest.mark.parametrize("lead", [pytest.param((3,), marks=pytest.mark.slow), (2, 2)])
 def test_learners_and_seeds_side_by_side_come_to_what_each_does_alone(lead: tuple[int]) -> None:
     several, launch = _several(*lead), Launch(32, 2, 4)
     together = lambda p, m, n: _fused(p, m, SMALL, n, launch)  # noqa: E731 - wrapped below

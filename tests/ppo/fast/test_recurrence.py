@@ -47,7 +47,9 @@ def _by_xla(weights: recurrence._Weights, seen: Any, begins: Any, before: Any) -
     return memory.remember_all(*given)
 
 
-@pytest.fixture(params=[0, ROWS], ids=["large tiles", "small tiles"])
+@pytest.fixture(
+    params=[0, pytest.param(ROWS, marks=pytest.mark.slow)], ids=["large tiles", "small tiles"]
+)
 def tile(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets the kernels take large or small tiles."""
     monkeypatch.setattr(recurrence, "MOST_SMALL", request.param)
