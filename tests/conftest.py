@@ -41,16 +41,17 @@ hypothesis.settings.load_profile("swarmjax")
 
 # The files that take longest begin first, so that both test processes end at about the same time.
 LONGEST = (
-    "training/test_mesh.py",
-    "run/test_reliability.py",
-    "run/test_train.py",
-    "ppo/fast/test_fused.py",
-    "training/test_loop.py",
-    "test_api.py",
-    "test_examples.py",
-    "run/test_printed_commands.py",
+    "training/test_seeds.py",
     "run/test_warm_start.py",
+    "run/test_reliability.py",
+    "run/test_checkpoint.py",
+    "training/test_critic.py",
+    "training/test_memory.py",
     "sim/test_physics.py",
+    "run/test_train.py",
+    "training/test_rollout.py",
+    "paper/test_golden.py",
+    "test_api.py",
 )
 
 

@@ -128,6 +128,7 @@ def _judged(path: Path, engine: Any, **rest: Any) -> Evaluation:
     return evaluate(_settings(path, engine=engine, **(given | rest)))
 
 
+@pytest.mark.slow
 def test_the_judges_agree_on_the_same_levels(tmp_path: Path) -> None:
     # A robot turns to its target, drives slowly and never stops, so it passes through the target.
     path = steering.write(tmp_path / "policy.npz", ((0.2, 0.0), (-2.0, 2.0), (-2.0, -2.0)))

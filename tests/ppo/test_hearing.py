@@ -68,7 +68,7 @@ def _think(kind: str, own: np.ndarray, rows: np.ndarray) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("order", [[1, 2, 0, 3], [3, 2, 1, 0], [0, 3, 1, 2]])
+@pytest.mark.parametrize("order", [[1, 2, 0, 3], [3, 2, 1, 0]])
 def test_the_order_of_neighbours_does_not_matter(kind: str, order: list[int]) -> None:
     own, rows = _seen()
     for found, expected in zip(
@@ -100,6 +100,7 @@ def test_a_policy_that_does_not_hear_has_the_weights_that_it_had() -> None:
     assert "hearing" not in made.params["actor"]
 
 
+@pytest.mark.slow
 def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
     ppo = _ppo(AlgoConfig(hidden_sizes=(8, 6), num_minibatches=1))
     draw = np.random.default_rng(0)

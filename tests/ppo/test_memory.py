@@ -272,6 +272,7 @@ def test_refuses_what_goes_with_no_memory(changed: dict[str, Any], said: str) ->
         AlgoConfig(**({"memory": "gru"} | changed))
 
 
+@pytest.mark.slow
 def test_a_uniform_unit_begins_within_the_bound_of_pytorch() -> None:
     config = replace(CONFIG, initialization="uniform", memory_size=64)
     params = learners.nets(config, WIDTH, 2).init(jax.random.key(0))["actor"]["memory"]

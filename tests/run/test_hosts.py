@@ -63,6 +63,7 @@ def test_processes_of_other_settings_are_refused(tmp_path: Path, coordinator: st
     assert not run.exists()
 
 
+@pytest.mark.slow
 def test_devices_are_those_of_all_processes(tmp_path: Path, coordinator: str) -> None:
     both = [_start(tmp_path / "run", coordinator, i) for i in range(2)]
     for code, said in map(_said, both):

@@ -428,6 +428,7 @@ def test_an_obstacle_is_felt_where_its_face_is(engine: Engine, half: float) -> N
     assert np.all(np.abs(gap[-1]) < (0.0008 if _body(engine) == "planar" else 0.002))  # as above
 
 
+@pytest.mark.slow
 def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
     obstacle = np.array([[0.0, 0.0, 0.3, 0.05, 0.05], AWAY[1]], np.float32)
     pose = np.array([[-0.1, 0.0, 0.0], [-0.2, 0.0, 0.0], [0.22, 0.22, 0.8]])

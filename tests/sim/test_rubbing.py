@@ -177,7 +177,7 @@ def pressed() -> dict[str, np.ndarray]:
     return found
 
 
-@pytest.mark.parametrize("engine", ["jax", "warp", "c"])
+@pytest.mark.parametrize("engine", [pytest.param("jax", marks=pytest.mark.slow), "warp", "c"])
 @pytest.mark.parametrize("row", range(len(SLIDES)), ids=[f"tan={t}" for t in SLIDES])
 def test_a_robot_slides_along_a_wall_by_coulombs_law(
     pressed: dict[str, np.ndarray], engine: str, row: int

@@ -183,6 +183,7 @@ def _cells(text: str, letter: str, cell: float = 0.12) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("letter", "field"), [("S", "start"), ("T", "target")])
+@pytest.mark.slow
 def test_robots_stay_in_their_areas(letter: str, field: str) -> None:
     centres = _cells(ROOMS, letter)
     for drawn in _draw(_stage(ROOMS, 3), 1000):

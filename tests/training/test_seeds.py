@@ -93,6 +93,7 @@ def test_neither_lane_nor_neighbours_matter(start: TrainState, run: Run) -> None
         _assert_same(_lane(moved, lane), _lane(found, seed))
 
 
+@pytest.mark.slow
 def test_a_broken_seed_leaves_the_others_alone(start: TrainState, run: Run) -> None:
     def broken(x: jax.Array) -> jax.Array:
         return x.at[1].set(np.nan)

@@ -182,6 +182,7 @@ def test_updates_count_when_every_seed_has_written_them(tmp_path: Path) -> None:
     assert status.progress(write(tmp_path / "run", rows), 2).done == 1
 
 
+@pytest.mark.slow
 def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)])
     views = Views(WatchConfig(run=str(run)))

@@ -62,6 +62,7 @@ def test_memories_are_those_of_the_unit() -> None:
 
 
 @pytest.mark.usefixtures("tile")
+@pytest.mark.slow
 def test_gradients_are_those_of_the_unit() -> None:
     seen, begins, before = _sequences()
     towards = _drawn(STEPS, ROWS, SIZE, seed=6)
