@@ -91,6 +91,7 @@ def test_step_env_sees_the_last_of_the_episode(
     assert_close(seen["agent_1"], last[1])
 
 
+@pytest.mark.slow
 def test_an_episode_starts_from_what_is_given(env: SwarmMultiAgentEnv, steps: list) -> None:
     again = env.reset(jax.random.key(5))
     actions = dict.fromkeys(AGENTS, jnp.zeros(2))

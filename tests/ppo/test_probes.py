@@ -146,6 +146,7 @@ def test_critic_learns_from_the_observation() -> None:
     np.testing.assert_allclose(_values(state, -1.0, 1.0), [-1.0, 1.0], atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_later_reward_is_discounted() -> None:
     state = _solve(Probe(2, lambda draw, clock: clock, lambda draw, action, clock: clock))
     # V(clock 1) = 1 and V(clock 0) = 0.5 * V(clock 1). The targets are exact once V(clock 1) is

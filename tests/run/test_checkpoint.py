@@ -258,6 +258,7 @@ except checkpoint.TrainingError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_is_one_sentence(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", _FULL, str(tmp_path)],

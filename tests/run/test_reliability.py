@@ -277,6 +277,7 @@ def test_a_signal_while_jax_loads_ends_with_a_sentence(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_two_processes_do_not_write_one_run(tmp_path: Path) -> None:
     first = _start([*TINY, f"budget={16 * 10**7}", f"run.dir={tmp_path}"])
     _wait_for(tmp_path / "metrics.jsonl")

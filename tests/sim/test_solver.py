@@ -135,7 +135,7 @@ JAMS = {
 @pytest.mark.parametrize(
     ("impl", "body", "solver"),
     [
-        pytest.param(*case, marks=[pytest.mark.slow] * (case[1:] == ("wheeled", "mjx")))
+        pytest.param(*case, marks=[pytest.mark.slow] * (case[2] == "mjx" or case[0] == "jax"))
         for case in JAMS
     ],
 )

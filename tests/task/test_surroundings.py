@@ -104,7 +104,7 @@ def test_a_wall_is_seen_by_its_nearest_point_and_its_ends() -> None:
     np.testing.assert_allclose(row, expected, atol=ROUND)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_rectangles_are_those_of_numpy(seed: int) -> None:
     draw = np.random.default_rng(seed)
     places, halves = draw.uniform(-0.4, 0.4, (20, 2)), draw.uniform(0.02, 0.2, (20, 2))

@@ -88,6 +88,7 @@ def _assert_same(found: Any, expected: Any) -> None:
 RESET = {"optimizer": "reset", "exploration": "reset"}
 
 
+@pytest.mark.slow
 def test_newcomers_take_over_in_turn(config: TrainConfig, trained: LearnerState) -> None:
     found = _promote(trained, config, before=2, after=5)
     # Robots 0 and 1 have trained. Robots 2, 3 and 4 copy the parameters, the optimiser and the

@@ -93,7 +93,6 @@ def test_neither_lane_nor_neighbours_matter(start: TrainState, run: Run) -> None
         _assert_same(_lane(moved, lane), _lane(found, seed))
 
 
-@pytest.mark.slow
 def test_a_broken_seed_leaves_the_others_alone(start: TrainState, run: Run) -> None:
     def broken(x: jax.Array) -> jax.Array:
         return x.at[1].set(np.nan)
@@ -148,7 +147,6 @@ def test_one_seed_is_what_the_loop_makes(
         np.testing.assert_allclose(lane, leaf, rtol=0.0, atol=1e-5, err_msg=name)
 
 
-@pytest.mark.slow
 def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> None:
     """Ends a cohort with made-up counts: the seeds reach all, half and none of 10 targets."""
     stages, cohort, threshold = 2, 2, 0.8
