@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -435,3 +436,8 @@ def test_gaps_agree_with_this_geometry(levels: dict[str, Level]) -> None:
         ]
         # 1e-5 m covers float32 at 5 m, where absent things are parked.
         np.testing.assert_allclose(found, np.stack(expected, axis=-1), atol=1e-5)
+
+
+def test_a_seed_has_16_bits_of_each_of_two_numbers() -> None:
+    drawn = SimpleNamespace(seed=np.array([0.75, 1.0 - 2.0**-16], np.float32))
+    assert level._seed(drawn, np) == 0xC000FFFF  # type: ignore[arg-type]
