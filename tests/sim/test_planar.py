@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from engines import ROBOTS, STEP
 
-from swarmjax.sim import model
+from swarmjax.sim import model, planar
 from swarmjax.sim.body import AS_BUILT, Chassis
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.planar import PLANAR
@@ -137,3 +137,9 @@ def test_the_friction_of_hulls_follows_the_chassis() -> None:
     built.pair_friction[place] = values
     alone = model.build(dataclasses.replace(robot, hull_friction=0.25), size, STEP).compile()
     np.testing.assert_allclose(built.pair_friction, alone.pair_friction, rtol=ROUNDING)
+
+
+def test_a_blocked_robot_turns_with_the_grip_of_its_wheels_times_half_the_track() -> None:
+    robot = RobotConfig()
+    forward, _, torque = planar._servos(robot, 0.001)[1]
+    assert torque == pytest.approx(0.5 * robot.grip_track * forward)
