@@ -132,7 +132,7 @@ def _origin(summary: Row) -> str:
 
 
 def _decisions(history: History) -> list[tuple]:
-    """Makes the table of promotions and demotions."""
+    """Makes the table of promotions."""
     step = history.config.arenas * history.config.algo.rollout_length
     shares = ("targets_reached", "all_reached")
     return [

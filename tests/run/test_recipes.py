@@ -15,7 +15,7 @@ def own(tmp_path: Path) -> Path:
     path = tmp_path / "mine.yaml"
     path.write_text(
         "stage: s3\nalgo:\n  hidden_sizes: [32, 16]\n  memory: gru\n"
-        "  memory_size: null\nrobot: wheeled\nrealism:\n  speed_noise: 0.1\n"
+        "  network: null\nrobot: wheeled\nrealism:\n  speed_noise: 0.1\n"
     )
     return path
 
