@@ -182,9 +182,9 @@ def adaptive(
     p is the success. The reason is that nothing is learned where every episode succeeds or none
     does (Tzannetos et al. 2023, "Proximal Curriculum for Reinforcement Learning Agents",
     arXiv:2304.12877; Rutherford et al. 2024, "No Regrets: Investigating and Improving Regret
-    Approximations for Curriculum Discovery", arXiv:2408.15099). `failure` is
-    1 - p, so a stage that never succeeds is practised most. `learnability` gives such a stage only
-    the floor. `failure` is useful if all stages can be solved.
+    Approximations for Curriculum Discovery", arXiv:2408.15099). `failure` is 1 - p, so a stage that
+    never succeeds is practised most. `learnability` gives such a stage only the floor. `failure` is
+    useful if all stages can be solved.
 
     With `prerequisites` the first stages of the sequence are practised alone, until all of them
     reach `threshold` or the deadline is past. Their skills are then learned before the other stages

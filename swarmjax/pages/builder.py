@@ -101,11 +101,6 @@ def write(out: Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> 
     """
     paths = [out / name for name in files]
     outputs.check("out", paths, overwrite=overwrite)
-    try:
-        for name, content in files.items():
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            (out / name).write_bytes(content)
-        outputs.note(paths)
-    except OSError as error:
-        raise outputs.unwritable("out", out, error) from None
+    outputs.make_room("out", out, out)
+    outputs.write(dict(zip(paths, files.values(), strict=True)))
     return paths
