@@ -3,11 +3,14 @@
 from dataclasses import replace
 from functools import cache
 
+import jax
+import numpy as np
+
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.networks import Networks, Sizes
-from swarmjax.ppo.ppo import PPO
+from swarmjax.ppo.ppo import PPO, LearnerState
 
 
 @cache
@@ -21,3 +24,12 @@ def ppo(config: AlgoConfig, sizes: Sizes, updates: int = 10, backend: Backend | 
 def nets(config: AlgoConfig, observation: int, action: int, state: int = 0) -> Networks:
     """Returns actor and critic."""
     return networks.make(config, Sizes(observation, action, state))
+
+
+def moved(state: LearnerState) -> LearnerState:
+    """Returns learners with random weights that tell them apart: critics begin near zero."""
+    draw = np.random.default_rng(0)
+    params = jax.tree.map(
+        lambda x: x + 0.2 * draw.standard_normal(x.shape, np.float32), state.params
+    )
+    return replace(state, params=params)

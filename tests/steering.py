@@ -45,3 +45,20 @@ def write(
     said = {"learners": learners, "activation": "relu", "config": {}, "versions": {}, "update": 0}
     policy_file.write(path, arrays, policies.meta(**{**said, **meta}))
     return path
+
+
+def arrays(drives: tuple) -> dict[str, np.ndarray]:
+    """Returns policies with one hidden layer, relu(bearing) and relu(-bearing); one per robot."""
+    count = len(drives)
+    bearing = np.zeros((count, observation.SIZE, 2), np.float32)
+    bearing[:, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
+    drive = np.array(drives, np.float32)
+    return {
+        "actor/hidden_0/kernel": bearing,
+        "actor/hidden_0/bias": np.zeros((count, 2), np.float32),
+        "actor/mean/kernel": drive[:, 1:],
+        "actor/mean/bias": drive[:, 0],
+        "actor/log_std": np.zeros((count, 2), np.float32),
+        "normalizer/mean": np.zeros((count, observation.SIZE), np.float32),
+        "normalizer/std": np.ones((count, observation.SIZE), np.float32),
+    }

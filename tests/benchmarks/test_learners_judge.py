@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import learners
 import numpy as np
 import pytest
+import steering
 from policies import EMBODIMENT
 from sentences import refusal
 
@@ -65,26 +66,9 @@ def levels(world: World, stage: StageConfig) -> Level:
     return learners_judge.draw_levels(world, stage, SEED, EPISODES)
 
 
-def _arrays(drives: tuple) -> dict[str, np.ndarray]:
-    """Returns policies with one hidden layer, relu(bearing) and relu(-bearing); one per robot."""
-    count = len(drives)
-    bearing = np.zeros((count, observation.SIZE, 2), np.float32)
-    bearing[:, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
-    drive = np.array(drives, np.float32)
-    return {
-        "actor/hidden_0/kernel": bearing,
-        "actor/hidden_0/bias": np.zeros((count, 2), np.float32),
-        "actor/mean/kernel": drive[:, 1:],
-        "actor/mean/bias": drive[:, 0],
-        "actor/log_std": np.zeros((count, 2), np.float32),
-        "normalizer/mean": np.zeros((count, observation.SIZE), np.float32),
-        "normalizer/std": np.ones((count, observation.SIZE), np.float32),
-    }
-
-
 def _learners(*drives: tuple) -> LearnerState:
     """Returns the same policies as learners [L], with only the parts that acting needs."""
-    arrays = _arrays(drives)
+    arrays = steering.arrays(drives)
 
     def layer(name: str) -> dict[str, np.ndarray]:
         return {part: arrays[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
@@ -120,7 +104,7 @@ def _by_c(folder: Path, stage: StageConfig, drives: tuple) -> dict[str, np.ndarr
         "update": 0,
     }
     path = folder / "policy.npz"
-    policy_file.write(path, _arrays(drives), meta)
+    policy_file.write(path, steering.arrays(drives), meta)
     settings = EvaluateConfig(
         policy=str(path),
         stage=stage,

@@ -15,7 +15,6 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.measures import MEASURES
 from swarmjax.sim.config import RobotConfig
-from swarmjax.task import observation
 from swarmjax.task.stage_config import StageConfig
 
 STAGES = (
@@ -28,23 +27,6 @@ CONTROL_STEP = 0.032  # Seconds.
 # Hand-made policies: the action at bearing 0, and the changes per radian to the left and right.
 STEER = ((1.0, 0.0), (-2.0, 2.0), (-2.0, -2.0))
 STAY = ((-1.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-
-
-def _arrays(drives: tuple) -> dict[str, np.ndarray]:
-    """Returns policies with one hidden layer, relu(bearing) and relu(-bearing); one per robot."""
-    count = len(drives)
-    bearing = np.zeros((count, observation.SIZE, 2), np.float32)
-    bearing[:, observation.NAMES.index("target_bearing")] = [1.0, -1.0]
-    drive = np.array(drives, np.float32)
-    return {
-        "actor/hidden_0/kernel": bearing,
-        "actor/hidden_0/bias": np.zeros((count, 2), np.float32),
-        "actor/mean/kernel": drive[:, 1:],
-        "actor/mean/bias": drive[:, 0],
-        "actor/log_std": np.zeros((count, 2), np.float32),
-        "normalizer/mean": np.zeros((count, observation.SIZE), np.float32),
-        "normalizer/std": np.ones((count, observation.SIZE), np.float32),
-    }
 
 
 def _judge(path: Path, stage: StageConfig, engine: Literal["c", "mjx"], **rest: Any) -> Evaluation:
@@ -108,7 +90,7 @@ def test_the_engines_of_the_command_agree(
 
 @pytest.mark.slow
 def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
-    given, told = policies.recalling(_arrays((STEER,)), 6)
+    given, told = policies.recalling(steering.arrays((STEER,)), 6)
     given["actor/mean/kernel"][:, 2:] *= 0.3  # smaller, beside the steering
     none = {name: array * ("memory" not in name) for name, array in given.items()}
     path = tmp_path / "policy.npz"

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
@@ -49,12 +50,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     config = replace(tiny_config, algo=_algo(tiny_config, request.param))
     program, schedule = programs.load(config)
     last = jax.jit(partial(loop.init, program))(schedule)
-    # Critics begin near zero, so the weights are moved to values that tell them apart.
-    draw = np.random.default_rng(0)
-    params = jax.tree.map(
-        lambda x: x + 0.2 * draw.standard_normal(x.shape, np.float32), last.learners.params
-    )
-    last = replace(last, learners=replace(last.learners, params=params))
+    last = replace(last, learners=learners.moved(last.learners))
     waiting = loop._draw(program, schedule, last.curriculum, jax.random.key(1), waiting=1)
     collect = jax.jit(partial(rollout.collect, program))
     # The arenas are in the middle of their episodes, which end at 16 steps.
