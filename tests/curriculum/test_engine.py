@@ -1,7 +1,6 @@
 """Checks the curriculum's counts and its decisions in mode `sequential` against values by hand."""
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -62,14 +62,6 @@ class Row(NamedTuple):
 
 
 PERFECT = [Episode(NOW)]
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _observe(
-    options: CurriculumConfig, schedule: Schedule, state: CurriculumState, ended: Ended, now: int
-) -> CurriculumState:
-    own, loss = stages.make(schedule, options), jnp.zeros(ended.cohort.shape)
-    return engine.observe(own, schedule, options.success, state, ended, loss, jnp.int32(now))
 
 
 def _config(base: TrainConfig, stages: int, **changes: object) -> TrainConfig:
@@ -132,7 +124,7 @@ def _run(
     for update, episodes in enumerate(seen, first):
         # An episode of no cohort stands for an update without episodes.
         ended = _ended(state, episodes or [Episode(cohorts.UNCOUNTED - 10)])
-        before, state = state, _observe(options, schedule, state, ended, update)
+        before, state = state, observe(options, schedule, state, ended, update)
         judged = int(before.chosen.stage)
         success = state.cohorts.record.deciding(options.success)[judged]
         numbers = int(state.chosen.stage), int(state.cohorts.number)
@@ -508,7 +500,7 @@ def test_the_most_robots_met_never_falls(schedule: Schedule) -> None:
     again = engine.init(stages.make(schedule, OPTIONS), schedule)
     back = dataclasses.replace(again, met=state.met)
     ended = _ended(back, [Episode(NOW, 10, 0)])
-    assert int(_observe(OPTIONS, schedule, back, ended, 0).met) == 2
+    assert int(observe(OPTIONS, schedule, back, ended, 0).met) == 2
 
 
 # --- the log

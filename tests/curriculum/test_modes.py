@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sentences import refusal
@@ -47,14 +48,6 @@ SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mix
 ADAPTIVE = CurriculumConfig(mode="adaptive")
 FAILURE = CurriculumConfig(mode="adaptive", score="failure")
 AFTER_TWO = CurriculumConfig(mode="adaptive", prerequisites=2)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _observe(
-    options: CurriculumConfig, numbers: Schedule, state: CurriculumState, ended: Ended, number: int
-) -> CurriculumState:
-    own, loss = stages.make(numbers, options), jnp.zeros(ended.cohort.shape)
-    return engine.observe(own, numbers, options.success, state, ended, loss, jnp.int32(number))
 
 
 def _schedule(count: int, **changes: Any) -> Schedule:
@@ -454,7 +447,7 @@ def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
     for number in range(UPDATES):
         index = stages.assign(state.chosen.weights, state.own.turn, ARENAS)
         arenas, ended = step(index, arenas, state.cohorts.number, jax.random.key(number))
-        state = _observe(options, numbers, state, ended, number)
+        state = observe(options, numbers, state, ended, number)
         why.append(int(state.chosen.reason))
         assert reference.update(ended, number) == why[-1]
         assert int(state.chosen.stage) == reference.stage
@@ -479,7 +472,7 @@ def test_no_decision_within_a_step_limit_of_the_last(seed: int, index: int) -> N
     numbers = _schedule(4, deadline=np.append(soon, np.int32(NEVER)))
     state, last = engine.init(stages.make(numbers, options), numbers), -COHORT
     for number in range(40):
-        state = _observe(options, numbers, _seen(state, random), _NOBODY, number)
+        state = observe(options, numbers, _seen(state, random), _NOBODY, number)
         if int(state.chosen.reason) != STAYED:
             assert number - last >= COHORT
             last = number
