@@ -1,4 +1,4 @@
-"""Your own pieces: reward terms, observations, level drawings and networks, from your own file.
+"""Your own pieces: rewards, observations, level drawings, networks and curricula, from a file.
 
 A piece is a function with one of the decorators below; a network is a Flax module. Commands take
 the file as `extensions=FILE`. `make_env` and `train_policy` also take a module or a list of pieces.
@@ -114,7 +114,15 @@ class Network(Piece):
     taken: ClassVar[tuple[str, ...]] = ("mlp",)
 
 
-KINDS = (RewardTerm, Observation, LevelDrawing, Network)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curriculum(Piece):
+    """A curriculum: `(Schedule) -> Curriculum`, both of `swarmjax.curriculum.engine`."""
+
+    kind: ClassVar[str] = "curriculum"
+    taken: ClassVar[tuple[str, ...]] = ("sequential", "mixed", "adaptive")
+
+
+KINDS = (RewardTerm, Observation, LevelDrawing, Network, Curriculum)
 
 
 def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
@@ -178,6 +186,11 @@ def network(module: type) -> Network:
     return Network(name=_snake(module.__name__), function=module)
 
 
+def curriculum(function: Callable) -> Curriculum:
+    """Turns a function into a curriculum; `curriculum.mode` selects it."""
+    return Curriculum(name=function.__name__, function=function)
+
+
 def _snake(name: str) -> str:
     """Turns the name of a class into the name of a key: ResidualNet into residual_net."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
@@ -191,12 +204,14 @@ class Extensions(NamedTuple):
       observations: extra entries of the observation.
       levels: ways to draw levels.
       networks: networks of actor and critic.
+      curricula: ways to choose the next episodes.
     """
 
     rewards: tuple[RewardTerm, ...] = ()
     observations: tuple[Observation, ...] = ()
     levels: tuple[LevelDrawing, ...] = ()
     networks: tuple[Network, ...] = ()
+    curricula: tuple[Curriculum, ...] = ()
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""

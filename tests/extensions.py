@@ -10,7 +10,7 @@ HEAD = """
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from swarmjax.extension import level_drawing, network, observation, reward_term
+from swarmjax.extension import curriculum, level_drawing, network, observation, reward_term
 """
 
 

@@ -4,71 +4,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from swarmjax.config import Section, about
-from swarmjax.config.section import MAX_COUNT, check_options
+from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config.section import check_options
+from swarmjax.extension import Curriculum
 
-_STEPWISE, _ADAPTIVE = ("sequential", "mixed"), ("adaptive",)
-_PROMOTING = (*_STEPWISE, "adaptive with prerequisites")
+MODES = ("sequential", "mixed", "adaptive")
+_STEPWISE, _ADAPTIVE = MODES[:2], MODES[2:]
 # The modes that read an option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
-    "earlier_share": ("mode", ("mixed",)),
+    "threshold": ("mode", _STEPWISE),
+    "budget_share": ("mode", _STEPWISE),
     "optimizer": ("mode", _STEPWISE),
     "exploration": ("mode", _STEPWISE),
-    "prerequisites": ("mode", _ADAPTIVE),
     "score": ("mode", _ADAPTIVE),
     "floor": ("mode", _ADAPTIVE),
     "shares": ("mode", _ADAPTIVE),
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class LevelsConfig(Section):
-    """Which levels of a stage are trained on."""
-
-    mode: Literal["random", "learnability", "value_loss"] = field(
-        default="random",
-        metadata=about(
-            "random: a new level every episode; learnability: a buffer of the levels with the "
-            "largest p (1 - p), where p is their success; value_loss: with the largest positive "
-            "value loss"
-        ),
-    )
-    buffer: int = field(
-        default=4096,
-        metadata=about(
-            "levels to keep, an equal number for each stage [learnability, value_loss]", 1, 2**20
-        ),
-    )
-    replay: float = field(
-        default=0.5,
-        metadata=about(
-            "share of episodes that begin on a level of a full buffer [learnability, value_loss]",
-            above=0.0,
-            below=1.0,
-        ),
-    )
-    temperature: float = field(
-        default=2.0,
-        metadata=about(
-            "replay is proportional to rank^(-1 / temperature) [learnability, value_loss]",
-            0.01,
-            100.0,
-        ),
-    )
-    staleness: float = field(
-        default=0.1,
-        metadata=about(
-            "share of the replay that depends on the time since a level was last played "
-            "[learnability, value_loss]",
-            0.0,
-            1.0,
-        ),
-    )
-
-    def _check(self) -> None:
-        buffered = ("mode", ("learnability", "value_loss"))
-        keys = ("buffer", "replay", "temperature", "staleness")
-        check_options(self, dict.fromkeys(keys, buffered))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,11 +29,12 @@ class CurriculumConfig(Section):
     Some options are read only by the modes that their meanings name in brackets.
     """
 
-    mode: Literal["sequential", "mixed", "adaptive"] = field(
+    mode: str = field(
         default="mixed",
         metadata=about(
             "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
-            "on all stages, more of them on stages with a higher score"
+            "on all stages, more of them on stages with a higher score; or the name of an "
+            "extension's curriculum"
         ),
     )
     success: Literal["targets", "all"] = field(
@@ -95,8 +47,7 @@ class CurriculumConfig(Section):
     threshold: float = field(
         default=0.8,
         metadata=about(
-            "success at which training moves on to the next stage [sequential, mixed, adaptive "
-            "with prerequisites]",
+            "success at which training moves on to the next stage [sequential, mixed]",
             0.0,
             1.0,
         ),
@@ -104,28 +55,16 @@ class CurriculumConfig(Section):
     budget_share: float = field(
         default=0.5,
         metadata=about(
-            "share of the budget for all stages before the last, in equal parts; adaptive: limit "
-            "for the prerequisites [sequential, mixed, adaptive with prerequisites]",
+            "share of the budget for all stages before the last, in equal parts "
+            "[sequential, mixed]",
             above=0.0,
             below=1.0,
         ),
-    )
-    earlier_share: float = field(
-        default=0.2,
-        metadata=about("share of the arenas on earlier stages [mixed]", above=0.0, below=1.0),
     )
     score: Literal["learnability", "failure"] = field(
         default="learnability",
         metadata=about(
             "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]"
-        ),
-    )
-    prerequisites: int = field(
-        default=0,
-        metadata=about(
-            "how many of the first stages to practise alone until each one succeeds [adaptive]",
-            0,
-            MAX_COUNT,
         ),
     )
     floor: float = field(
@@ -151,8 +90,24 @@ class CurriculumConfig(Section):
             "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
         ),
     )
-    levels: LevelsConfig = field(default_factory=LevelsConfig)
+    levels: Literal["none", "learnability", "value_loss"] = field(
+        default="none",
+        metadata=about(
+            "levels to replay; none: a new level every episode; learnability: those with the "
+            "largest p (1 - p), where p is their success; value_loss: those with the largest "
+            "positive value loss"
+        ),
+    )
 
     def _check(self) -> None:
-        promoting = dict.fromkeys(("threshold", "budget_share"), ("mode", _PROMOTING))
-        check_options(self, _READ_BY | ({} if self.prerequisites else promoting))
+        check_options(self, _READ_BY)
+
+
+def check_mode(mode: str, own: Sequence[Curriculum]) -> None:
+    """Refuses a `curriculum.mode` that is neither built in nor a curriculum of an extension."""
+    names = [*MODES, *(piece.name for piece in own)]
+    if mode not in names:
+        raise ConfigError(
+            f"curriculum.mode is {show(mode)}: give one of {', '.join(names)}, or extensions=FILE, "
+            "a file that defines it."
+        )

@@ -39,23 +39,15 @@ class Schedule(NamedTuple):
       stages: [S], in order.
       deadline: [S] update at which the stage ends at the latest, int32.
       threshold: [] success that promotes.
-      earlier_share: [] share of the arenas on earlier stages.
       floor: [] share of the arenas that is spread evenly over all stages.
       cohort_updates: [] updates of one step limit, int32.
-      replay: [] share of episodes that begin on a level of a full buffer.
-      temperature: [] temperature of the levels' ranks; higher: levels are replayed more evenly.
-      staleness: [] share of replays chosen by how long the levels have not been played.
     """
 
     stages: Stage
     deadline: Array | np.ndarray
     threshold: Array | np.float32
-    earlier_share: Array | np.float32
     floor: Array | np.float32
     cohort_updates: Array | np.int32
-    replay: Array | np.float32
-    temperature: Array | np.float32
-    staleness: Array | np.float32
 
 
 class StageChoice(NamedTuple):
@@ -149,8 +141,7 @@ def schedule(
 ) -> Schedule:
     """Computes the curriculum's numbers.
 
-    The stages before the last share `budget_share` of the updates in equal parts. Prerequisites may
-    use the whole of this share.
+    The stages before the last share `budget_share` of the updates in equal parts.
 
     Args:
       stages: S, in order.
@@ -165,17 +156,14 @@ def schedule(
     """
     share = options.budget_share * updates / max(len(stages) - 1, 1)
     deadline = [math.ceil(share * (i + 1)) for i in range(len(stages) - 1)]
-    if options.mode == "adaptive":
-        end = deadline[-1] if options.prerequisites else NEVER
-        deadline = [end] * len(deadline)
-    keys = ("threshold", "earlier_share", "floor")
-    replayed = ("replay", "temperature", "staleness")
+    if options.mode not in ("sequential", "mixed"):
+        deadline = [NEVER] * len(deadline)
     return Schedule(
         stages=task_stage.stack(stages, drawings),
         deadline=np.array([*deadline, NEVER], np.int32),
+        threshold=np.float32(options.threshold),
+        floor=np.float32(options.floor),
         cohort_updates=np.int32(math.ceil(step_limit / rollout)),
-        **{key: np.float32(getattr(options, key)) for key in keys},
-        **{key: np.float32(getattr(options.levels, key)) for key in replayed},
     )
 
 

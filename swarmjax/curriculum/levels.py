@@ -22,16 +22,19 @@ from jax import Array
 
 from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.config import CurriculumConfig
-from swarmjax.curriculum.engine import Curriculum, CurriculumOutcomes, Next, Schedule, StageChoice
+from swarmjax.curriculum.engine import Curriculum, CurriculumOutcomes, Next, StageChoice
 from swarmjax.task.episode import Ended
 
-# Score of an empty place, below every real score.
-_EMPTY = -1.0
-# Episodes after which a level's older results fade, because the policy changes. The number is this
-# project's choice.
-_MEMORY = 16.0
-# Weight of what is known before a level's first episode. This knowledge counts as much as two
-# episodes with the mean success of the level's stage. The number is this project's choice.
+_EMPTY = -1.0  # score of an empty place, below every real score
+# The numbers below are this project's choice. With thousands of arenas, the papers' temperatures
+# (0.1 to 0.3) would put most of the arenas on a single level.
+_PLACES = 4096  # levels of the buffer, an equal number for each stage
+_REPLAY = 0.5  # share of episodes that begin on a level of a full buffer
+_TEMPERATURE = 2.0  # replay is proportional to rank^(-1 / temperature)
+_STALENESS = 0.1  # share of the replay that depends on the time since a level was last played
+_MEMORY = 16.0  # episodes after which a level's older results fade, because the policy changes
+# What is known before a level's first episode counts as much as this number of episodes with the
+# mean success of the level's stage.
 _PRIOR_EPISODES = 2.0
 
 
@@ -101,29 +104,22 @@ class Plays(NamedTuple):
     loss: Array
 
 
-def make(inner: Curriculum, schedule: Schedule, options: CurriculumConfig) -> Curriculum:
-    """Adds a buffer of levels to a curriculum over stages.
+def make(inner: Curriculum, stages: int, options: CurriculumConfig) -> Curriculum:
+    """Adds a buffer of levels to a curriculum over `stages` stages.
 
-    Args:
-      inner: the curriculum over stages.
-      schedule: the curriculum's numbers.
-      options: settings of the curriculum.
-
-    Returns:
-      The curriculum. Half of the levels that it chooses are new, by default.
+    Half of the levels that it chooses are new, once the buffer is full.
     """
 
     def init() -> ReplayState:
-        stages = schedule.deadline.shape[0]
-        buffer = empty(stages, options.levels.buffer // stages)
+        buffer = empty(stages, max(1, _PLACES // stages))
         return ReplayState(inner=inner.init(), buffer=buffer, update=jnp.zeros((), jnp.int32))
 
     def choose(state: ReplayState, key: Array, free: tuple[int, int]) -> Next:
         seed_key, pick_key, inner_key = jax.random.split(key, 3)
         stage = inner.choose(state.inner, inner_key, free).stage
-        shares = probabilities(state.buffer, schedule, state.update)
+        shares = probabilities(state.buffer, state.update)
         picks = jax.random.uniform(pick_key, (stage.size, 2))
-        place = pick(state.buffer, schedule.replay, shares, stage.ravel(), picks).reshape(free)
+        place = pick(state.buffer, shares, stage.ravel(), picks).reshape(free)
         again = place >= 0
         old = state.buffer.seed.ravel()[jnp.maximum(place, 0)]
         new = jax.random.bits(seed_key, free, jnp.uint32)
@@ -135,7 +131,7 @@ def make(inner: Curriculum, schedule: Schedule, options: CurriculumConfig) -> Cu
         usual = jnp.where(jnp.isfinite(fast), fast, 0.5)
         return ReplayState(
             inner=inner.observe(state.inner, outcomes),
-            buffer=update(state.buffer, plays, options.levels.mode, usual, state.update),
+            buffer=update(state.buffer, plays, options.levels, usual, state.update),
             update=state.update + 1,
         )
 
@@ -154,16 +150,15 @@ def empty(stages: int, places: int) -> LevelBuffer:
     )
 
 
-def probabilities(buffer: LevelBuffer, schedule: Schedule, now: Array) -> Array:
+def probabilities(buffer: LevelBuffer, now: Array) -> Array:
     """Computes how probable each level is, given that a level of the same stage is replayed.
 
     The probability is (1 - rho) P_score + rho P_stale. P_score is proportional to rank^(-1 /
     temperature). P_stale is proportional to the number of updates since an episode last ended on
-    the level (Jiang et al. 2021, equations 2 to 5).
+    the level. rho is the staleness (Jiang et al. 2021, equations 2 to 5).
 
     Args:
       buffer: buffer of levels.
-      schedule: `temperature` and `staleness` (rho).
       now: [] number of finished updates.
 
     Returns:
@@ -171,11 +166,11 @@ def probabilities(buffer: LevelBuffer, schedule: Schedule, now: Array) -> Array:
     """
     order = jnp.argsort(-buffer.score, axis=1, stable=True)
     rank = jnp.argsort(order, axis=1, stable=True) + 1
-    weight = jnp.exp(-jnp.log(rank.astype(jnp.float32)) / schedule.temperature)
+    weight = jnp.exp(-jnp.log(rank.astype(jnp.float32)) / _TEMPERATURE)
     by_score = _normal(jnp.where(buffer.held, weight, 0.0))
     age = jnp.where(buffer.held, now - buffer.played, 0).astype(jnp.float32)
     by_age = jnp.where(jnp.any(age > 0.0, axis=1, keepdims=True), _normal(age), by_score)
-    return (1.0 - schedule.staleness) * by_score + schedule.staleness * by_age
+    return (1.0 - _STALENESS) * by_score + _STALENESS * by_age
 
 
 def _normal(weight: Array) -> Array:
@@ -184,9 +179,7 @@ def _normal(weight: Array) -> Array:
     return weight / jnp.where(total > 0.0, total, 1.0)
 
 
-def pick(
-    buffer: LevelBuffer, replay: Array | np.float32, shares: Array, stage: Array, picks: Array
-) -> Array:
+def pick(buffer: LevelBuffer, shares: Array, stage: Array, picks: Array) -> Array:
     """Picks the level on which each episode begins.
 
     The replayed share grows with the filled part of the stage's places, so that the first levels
@@ -194,7 +187,6 @@ def pick(
 
     Args:
       buffer: buffer of levels.
-      replay: share of episodes that begin on a level of a full buffer.
       shares: [S, C] from `probabilities`.
       stage: [E] stage of the episodes.
       picks: [E, 2] uniform numbers in [0, 1).
@@ -204,7 +196,7 @@ def pick(
     """
     stages, places = shares.shape
     held = buffer.held
-    share = replay * jnp.mean(held.astype(jnp.float32), axis=1)
+    share = _REPLAY * jnp.mean(held.astype(jnp.float32), axis=1)
     ends = jnp.cumsum(shares, axis=1)
     ends = ends / jnp.maximum(ends[:, -1:], np.finfo(np.float32).tiny)
     # Puts the cumulative shares of all stages on one line, so that one search suffices. The shares
@@ -257,13 +249,24 @@ def update(buffer: LevelBuffer, plays: Plays, mode: str, usual: Array, now: Arra
     Returns:
       The buffer after.
     """
-    buffer = _record(buffer, plays, now)
+    # Adds up whole numbers before any division, because their sum is the same in any order.
+    one = jnp.ones_like(plays.stage)
+    values = [one, plays.successes, plays.trials, plays.loss]
+    new, successes, trials, loss = _sums(buffer, plays, values)
+    episodes = buffer.episodes + new
+    successes = buffer.successes + new * (successes / jnp.maximum(trials, 1))
+    kept = jnp.minimum(1.0, _MEMORY / jnp.maximum(episodes, 1.0))
+    episodes, successes = kept * episodes, kept * successes
     if mode == "learnability":
-        score = learnability(buffer.episodes, buffer.successes, usual[:, None])
-        buffer = replace(buffer, score=jnp.where(buffer.held, score, _EMPTY))
-    else:
-        buffer = replace(buffer, score=_newest_loss(buffer, plays))
-    return _admit(buffer, plays, mode, usual, now)
+        score = learnability(episodes, successes, usual[:, None])
+        score = jnp.where(episodes > 0.0, score, _EMPTY)
+    else:  # the newest positive value loss (Jiang et al. 2021, "Replay-Guided ...", equation 3)
+        score = jnp.where(new > 0, loss / jnp.maximum(new, 1), buffer.score)
+    played = jnp.where(new > 0, now, buffer.played)
+    scored = LevelBuffer(
+        seed=buffer.seed, episodes=episodes, successes=successes, score=score, played=played
+    )
+    return _admit(scored, plays, mode, usual, now)
 
 
 def learnability(episodes: Array, successes: Array, usual: Array) -> Array:
@@ -292,28 +295,6 @@ def _sums(buffer: LevelBuffer, plays: Plays, values: list[Array]) -> list[Array]
         return blank.at[at].add(value, mode="drop").reshape(buffer.seed.shape)
 
     return [total(value) for value in values]
-
-
-def _record(buffer: LevelBuffer, plays: Plays, now: Array) -> LevelBuffer:
-    """Adds the outcomes of episodes on levels of the buffer."""
-    # Adds up whole numbers before any division, because their sum is the same in any order.
-    one = jnp.ones_like(plays.stage)
-    new, successes, trials = _sums(buffer, plays, [one, plays.successes, plays.trials])
-    episodes = buffer.episodes + new
-    successes = buffer.successes + new * (successes / jnp.maximum(trials, 1))
-    kept = jnp.minimum(1.0, _MEMORY / jnp.maximum(episodes, 1.0))
-    return replace(
-        buffer,
-        episodes=kept * episodes,
-        successes=kept * successes,
-        played=jnp.where(new > 0, now, buffer.played),
-    )
-
-
-def _newest_loss(buffer: LevelBuffer, plays: Plays) -> Array:
-    """Returns the newest positive value loss (Jiang et al. 2021, "Replay-Guided ...", eq. 3)."""
-    new, loss = _sums(buffer, plays, [jnp.ones_like(plays.stage), plays.loss])
-    return jnp.where(new > 0, loss / jnp.maximum(new, 1), buffer.score)
 
 
 def _admit(buffer: LevelBuffer, plays: Plays, mode: str, usual: Array, now: Array) -> LevelBuffer:

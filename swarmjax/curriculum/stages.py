@@ -8,7 +8,6 @@ update, without verdicts, and then returns where a run begins.
 from collections.abc import Callable
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -29,6 +28,7 @@ from swarmjax.curriculum.engine import (
     StageChoice,
 )
 
+_EARLIER = 0.2  # share of the arenas on earlier stages with `mixed`: this project's choice
 _UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
@@ -114,14 +114,14 @@ def assign(weights: Array, turn: Array, arenas: int) -> Array:
     return jnp.minimum(stage, last).astype(jnp.int32)
 
 
-def sequential(
+def promoting(
     state: StagesState,
     schedule: Schedule,
     options: CurriculumConfig,
     verdict: CohortVerdict,
     update: Array,
 ) -> StageChoice:
-    """Puts all arenas on the newest stage, and moves all of them on to the next stage.
+    """Moves the arenas on to the next stage; `mixed` keeps some of them on earlier stages, evenly.
 
     The next stage begins when a whole cohort of the current stage has reached `threshold`, or at
     the stage's deadline. At least one step limit lies between two decisions.
@@ -137,32 +137,8 @@ def sequential(
       The choice from the next update on.
     """
     stage, reason = _promote(state, schedule, verdict, update)
-    weights = jax.nn.one_hot(stage, state.chosen.weights.shape[0], dtype=jnp.float32)
-    return StageChoice(stage=stage, weights=weights, reason=reason)
-
-
-def mixed(
-    state: StagesState,
-    schedule: Schedule,
-    options: CurriculumConfig,
-    verdict: CohortVerdict,
-    update: Array,
-) -> StageChoice:
-    """Decides as `sequential`, but keeps `earlier_share` of the arenas on earlier stages, evenly.
-
-    Args:
-      state: as in `sequential`.
-      schedule: as in `sequential`.
-      options: as in `sequential`.
-      verdict: as in `sequential`.
-      update: as in `sequential`.
-
-    Returns:
-      The choice from the next update on.
-    """
-    stage, reason = _promote(state, schedule, verdict, update)
     index = jnp.arange(state.chosen.weights.shape[0])
-    share = jnp.where(stage > 0, jnp.asarray(schedule.earlier_share), 0.0)
+    share = jnp.where(stage > 0, _EARLIER if options.mode == "mixed" else 0.0, 0.0)
     earlier = jnp.where(index < stage, share / jnp.maximum(stage, 1), 0.0)
     return StageChoice(
         stage=stage, weights=jnp.where(index == stage, 1.0 - share, earlier), reason=reason
@@ -186,56 +162,30 @@ def adaptive(
     never succeeds is practised most. `learnability` gives such a stage only the floor. `failure` is
     useful if all stages can be solved.
 
-    With `prerequisites` the first stages of the sequence are practised alone, until all of them
-    reach `threshold` or the deadline is past. Their skills are then learned before the other stages
-    teach different ones.
-
     Args:
-      state: as in `sequential`.
-      schedule: as in `sequential`.
-      options: as in `sequential`.
-      verdict: as in `sequential`.
-      update: as in `sequential`.
+      state: as in `promoting`.
+      schedule: as in `promoting`.
+      options: as in `promoting`.
+      verdict: as in `promoting`.
+      update: as in `promoting`.
 
     Returns:
-      The choice from the next update on; its newest stage is the last one that is practised.
+      The choice from the next update on; its newest stage is the last one.
     """
-    stage, reason = _unlock(state, schedule, options, verdict, update)
-    practised = jnp.arange(state.chosen.weights.shape[0]) <= stage
-    count = jnp.sum(practised, dtype=jnp.float32)
-    found = jnp.where(practised, _SCORES[options.score](verdict.record), 0.0)
-    total = jnp.sum(found)
-    share = jnp.where(total > 0.0, found / jnp.where(total > 0.0, total, 1.0), 1.0 / count)
+    stages = state.chosen.weights.shape[0]
+    score = _SCORES[options.score](verdict.record)
+    total = jnp.sum(score)
+    share = jnp.where(total > 0.0, score / jnp.where(total > 0.0, total, 1.0), 1.0 / stages)
     floor = jnp.asarray(schedule.floor)
-    weights = jnp.where(practised, floor / count + (1.0 - floor) * share, 0.0)
+    weights = floor / stages + (1.0 - floor) * share
     if options.shares == "robots":
         weights = _per_robot(weights, jnp.asarray(schedule.stages.robots))
+    judged = verdict.over & jnp.any(verdict.judged)
     return StageChoice(
-        stage=stage,
+        stage=jnp.full_like(state.chosen.stage, stages - 1),
         weights=jnp.where(verdict.over, weights, state.chosen.weights),
-        reason=reason,
+        reason=jnp.where(judged, REWEIGHED, STAYED).astype(jnp.int32),
     )
-
-
-def _unlock(
-    state: StagesState,
-    schedule: Schedule,
-    options: CurriculumConfig,
-    verdict: CohortVerdict,
-    update: Array,
-) -> tuple[Array, Array]:
-    """Returns the last stage that is practised, and the reason for a change of weights."""
-    reweighed = jnp.where(verdict.over & jnp.any(verdict.judged), REWEIGHED, STAYED)
-    last = jnp.full_like(state.chosen.stage, state.chosen.weights.shape[0] - 1)
-    if not options.prerequisites:
-        return last, reweighed.astype(jnp.int32)
-    first = options.prerequisites
-    passed = jnp.all(verdict.record.fast[:first] >= schedule.threshold)
-    late = update + 1 >= jnp.asarray(schedule.deadline)[first - 1]
-    unlocked = state.chosen.stage == last
-    opens = verdict.over & (passed | late) & ~unlocked
-    reason = jnp.where(opens, jnp.where(passed, BY_THRESHOLD, BY_BUDGET), reweighed)
-    return jnp.where(unlocked | opens, last, first - 1), reason.astype(jnp.int32)
 
 
 def _promote(
@@ -271,4 +221,4 @@ def _failure(record: Record) -> Array:
 
 
 _SCORES = {"learnability": _learnability, "failure": _failure}
-MODES: dict[str, Mode] = {"sequential": sequential, "mixed": mixed, "adaptive": adaptive}
+MODES: dict[str, Mode] = {"sequential": promoting, "mixed": promoting, "adaptive": adaptive}

@@ -14,6 +14,7 @@ import jax
 from swarmjax import extension, provenance, words
 from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.curriculum import engine as curriculum
+from swarmjax.curriculum.config import MODES
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.policy import PolicyError
 from swarmjax.ppo import optimizer
@@ -407,12 +408,13 @@ def _learning(settings: TrainConfig) -> str:
 def _own_pieces(settings: TrainConfig) -> str:
     """Lists the pieces of the extension that a run uses."""
     chosen = pieces.choose(extension.load(settings.extensions), settings.task, settings.stage)
-    used = {stage.level for stage in settings.stage}
+    used, mode = {stage.level for stage in settings.stage}, settings.curriculum.mode
     found = [
         *(f"reward {piece.name} times {weight:g}" for piece, weight in chosen.terms),
         *(f"observation {piece.name}" for piece in chosen.observations),
         *(f"level {piece.name}" for piece in chosen.drawings if piece.name in used),
         *([] if settings.algo.network in (None, "mlp") else [f"network {settings.algo.network}"]),
+        *([] if mode in MODES else [f"curriculum {mode}"]),
     ]
     return ", ".join(found) or "nothing is used"
 
@@ -420,7 +422,7 @@ def _own_pieces(settings: TrainConfig) -> str:
 def _short_budget(settings: TrainConfig, schedule: Schedule) -> list[str]:
     """Warns, in at most one sentence, if the budget is too short for the stages."""
     share = settings.curriculum.budget_share
-    if settings.curriculum.mode == "adaptive":
+    if settings.curriculum.mode not in ("sequential", "mixed"):
         return []
     begins, latest = curriculum.last_begins(schedule), math.ceil(share * settings.updates)
     if begins <= latest:

@@ -8,6 +8,7 @@ from typing import Any
 from swarmjax import extension
 from swarmjax.config import ConfigError, build, files, inherit, reading, section, show, to_dict
 from swarmjax.config.section import build_stored
+from swarmjax.curriculum.config import check_mode
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
@@ -143,6 +144,7 @@ def settle(settings: TrainConfig) -> TrainConfig:
     extension.check_needs(settings.pieces, found, "the stored run")
     used = pieces.choose(found, settings.task, settings.stage)
     network = resolve(settings.algo, found.networks)
+    check_mode(settings.curriculum.mode, found.curricula)
     if settings.extensions is None:
         return settings
     drawn = {stage.level for stage in settings.stage}
@@ -151,6 +153,7 @@ def settle(settings: TrainConfig) -> TrainConfig:
         observations=used.observations,
         levels=tuple(each for each in found.levels if each.name in drawn),
         networks=tuple(each for each in found.networks if each.name == network),
+        curricula=tuple(each for each in found.curricula if each.name == settings.curriculum.mode),
     )
     return replace(
         settings,

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax import words
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task.config import check_realism
@@ -165,12 +164,10 @@ class TrainConfig(ProgramConfig):
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
-        self._check_prerequisites()
         self._check_devices()
         self._check_budget()
         self._check_counts()
         self._check_algo()
-        self._check_levels()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
@@ -195,14 +192,6 @@ class TrainConfig(ProgramConfig):
                         f"{where}{key} is {value}, but sim.max_{key} is {most}: "
                         f"give {least} to {most}."
                     )
-
-    def _check_prerequisites(self) -> None:
-        first, stages = self.curriculum.prerequisites, len(self.stage)
-        if first and first >= stages:
-            raise ConfigError(
-                f"curriculum.prerequisites is {first}, but the run has "
-                f"{words.count(stages, 'stage')}: give at most {stages - 1}."
-            )
 
     def _check_devices(self) -> None:
         share = self.arena_devices
@@ -245,14 +234,6 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
                 f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
-            )
-
-    def _check_levels(self) -> None:
-        levels = self.curriculum.levels
-        if levels.mode != "random" and levels.buffer < len(self.stage):
-            raise ConfigError(
-                f"curriculum.levels.buffer is {levels.buffer}, but {len(self.stage)} stages share "
-                f"it equally: give at least {len(self.stage)}."
             )
 
     def _check_algo(self) -> None:

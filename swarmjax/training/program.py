@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import jax
 
 from swarmjax import extension
+from swarmjax.config.foreign_code import explained
 from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum import levels
 from swarmjax.curriculum import stages as stage_modes
@@ -14,7 +15,7 @@ from swarmjax.ppo.ppo import PPO
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
-from swarmjax.task import env, surroundings
+from swarmjax.task import env, extended, surroundings
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
@@ -55,10 +56,15 @@ class Program[C: ProgramConfig]:
     def curriculum(self, schedule: Schedule) -> Curriculum:
         """Returns the curriculum with the numbers of a schedule."""
         options = self.config.curriculum
-        by_stage = stage_modes.make(schedule, options)
-        if options.levels.mode == "random":
+        own = {piece.name: piece for piece in extension.load(self.config.extensions).curricula}
+        if options.mode in own:
+            guard = explained(f"{extended.label(own[options.mode])} fails")
+            by_stage = Curriculum(*map(guard, guard(own[options.mode].function)(schedule)))
+        else:
+            by_stage = stage_modes.make(schedule, options)
+        if options.levels == "none":
             return by_stage
-        return levels.make(by_stage, schedule, options)
+        return levels.make(by_stage, len(self.config.stage), options)
 
 
 def shards_of(config: ProgramConfig) -> Shards:

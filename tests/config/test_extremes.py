@@ -42,7 +42,6 @@ WITH = {
     "std_decrement": {"exploration": "scheduled"},
     "std_interval": {"exploration": "scheduled"},
     "std_floor": {"exploration": "scheduled"},
-    "earlier_share": {"mode": "mixed"},
     "floor": {"mode": "adaptive"},
     "infrared_noise": {"infrared": "real"},
 }

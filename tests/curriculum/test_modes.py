@@ -4,7 +4,6 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +13,6 @@ import pytest
 from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sentences import refusal
 
 from swarmjax.curriculum import cohorts, engine, stages
 from swarmjax.curriculum.cohorts import CohortVerdict
@@ -33,7 +31,6 @@ from swarmjax.curriculum.engine import (
 )
 from swarmjax.curriculum.stages import MODES, StagesState
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task.config import TaskConfig
@@ -47,7 +44,7 @@ COHORT = 4  # updates
 SEQUENTIAL, MIXED = (CurriculumConfig(mode=mode) for mode in ("sequential", "mixed"))
 ADAPTIVE = CurriculumConfig(mode="adaptive")
 FAILURE = CurriculumConfig(mode="adaptive", score="failure")
-AFTER_TWO = CurriculumConfig(mode="adaptive", prerequisites=2)
+EARLIER = 0.2  # share of the arenas on earlier stages with `mixed`
 
 
 def _schedule(count: int, **changes: Any) -> Schedule:
@@ -56,7 +53,6 @@ def _schedule(count: int, **changes: Any) -> Schedule:
     config = TrainConfig(stage=chosen, sim=SimConfig(max_robots=9))
     numbers = programs.schedule(config)._replace(
         deadline=np.full(count, NEVER, np.int32),
-        earlier_share=np.float32(0.25),
         floor=np.float32(0.1),
         cohort_updates=np.int32(COHORT),
     )
@@ -153,8 +149,8 @@ def test_a_stage_that_was_not_judged_now_is_not_decided_by_what_it_once_did() ->
     ("stage", "weights"),
     [
         (0, [1.0, 0.0, 0.0, 0.0]),
-        (1, [0.25, 0.75, 0.0, 0.0]),
-        (3, [0.25 / 3, 0.25 / 3, 0.25 / 3, 0.75]),
+        (1, [0.2, 0.8, 0.0, 0.0]),
+        (3, [0.2 / 3, 0.2 / 3, 0.2 / 3, 0.8]),
     ],
 )
 def test_mixed_keeps_a_share_on_earlier_stages(stage: int, weights: list[float]) -> None:
@@ -187,70 +183,6 @@ def test_adaptive_weighs_by_its_score(
     expected = 0.1 / 4 + 0.9 * np.array(score) / sum(score)
     np.testing.assert_allclose(chosen.weights, expected, rtol=1e-5)  # differences in float32
     assert (int(chosen.stage), int(chosen.reason)) == (3, REWEIGHED)
-
-
-@pytest.mark.parametrize(
-    ("newest", "fast", "update", "to", "reason"),
-    [
-        (1, [0.79, 0.9, NAN, NAN], 3, 1, REWEIGHED),
-        (1, [0.9, NAN, NAN, NAN], 3, 1, REWEIGHED),
-        (1, [0.8, 0.8, NAN, NAN], 3, 3, BY_THRESHOLD),
-        (1, [0.5, 0.0, NAN, NAN], 48, 1, REWEIGHED),
-        (1, [0.5, 0.0, NAN, NAN], 49, 3, BY_BUDGET),
-        (3, [0.1, 0.0, 0.5, 0.5], 50, 3, REWEIGHED),  # unlocked stages stay unlocked
-    ],
-)
-def test_prerequisites_are_practised_alone_until_each_succeeds(
-    newest: int, fast: list[float], update: int, to: int, reason: int
-) -> None:
-    numbers = _schedule(4, deadline=np.array([50, 50, 50, NEVER], np.int32))
-    verdict = _verdict([0.5] * 4, fast=fast)
-    found = _choose(AFTER_TWO, _state(newest, 4), numbers, verdict, update)
-    assert (int(found.stage), int(found.reason)) == (to, reason)
-    locked = to == 1
-    assert (np.asarray(found.weights) > 0.0).tolist() == [True, True, not locked, not locked]
-    assert float(jnp.sum(found.weights)) == pytest.approx(1.0, abs=1e-6)  # float32
-
-
-def test_prerequisites_are_left_at_the_end_of_a_cohort() -> None:
-    verdict = _verdict([1.0] * 4, over=False, fast=[1.0, 1.0, NAN, NAN])
-    found = _choose(AFTER_TWO, _state(1, 4), _schedule(4), verdict, 3)
-    assert (int(found.stage), int(found.reason)) == (1, STAYED)
-
-
-def test_a_run_begins_on_its_prerequisites() -> None:
-    begun = stages.make(_schedule(4), AFTER_TWO).init()
-    assert begun.chosen.weights.tolist() == [0.5, 0.5, 0.0, 0.0]
-
-
-def test_there_are_fewer_prerequisites_than_stages() -> None:
-    words = ["stage=curriculum", "curriculum.mode=adaptive", "curriculum.prerequisites=6"]
-    assert refusal(load_train, words) == (
-        "curriculum.prerequisites is 6, but the run has 6 stages: give at most 5."
-    )
-    assert load_train([*words, "curriculum.prerequisites=5"]).curriculum.prerequisites == 5
-
-
-def test_adaptive_takes_a_threshold_with_prerequisites_alone() -> None:
-    assert refusal(partial(CurriculumConfig, mode="adaptive", threshold=0.9)) == (
-        "threshold is 0.9, but mode is adaptive: threshold is an option of sequential and mixed "
-        "and adaptive with prerequisites, so give 0.8 or mode=sequential."
-    )
-    options = CurriculumConfig(mode="adaptive", threshold=0.9, prerequisites=1)
-    assert (options.threshold, options.budget_share) == (0.9, 0.5)
-
-
-def test_prerequisites_may_take_their_share_of_the_budget() -> None:
-    chosen = tuple(StageConfig(name=f"s{i}", robots=1, side=1.0) for i in range(4))
-    for first in (1, 3):
-        found = engine.schedule(
-            chosen,
-            CurriculumConfig(mode="adaptive", prerequisites=first, budget_share=0.25),
-            updates=100,
-            step_limit=10,
-            rollout=10,
-        )
-        assert found.deadline.tolist() == [25, 25, 25, NEVER]
 
 
 def test_shares_of_robots_give_stages_of_many_robots_fewer_arenas() -> None:
@@ -386,8 +318,8 @@ class Reference:
         weights = np.zeros(self.stages)
         weights[self.stage] = 1.0
         if self.options.mode == "mixed" and self.stage:
-            weights[: self.stage] = self.numbers.earlier_share / self.stage
-            weights[self.stage] = 1 - self.numbers.earlier_share
+            weights[: self.stage] = EARLIER / self.stage
+            weights[self.stage] = 1 - EARLIER
         return weights
 
 
@@ -432,7 +364,7 @@ EARLY = np.array([9, 90, NEVER], np.int32)
 CASES = {
     "sequential": (SEQUENTIAL, {"deadline": EARLY}),
     "sequential-all": (CurriculumConfig(mode="sequential", success="all"), {"deadline": EARLY}),
-    "mixed": (MIXED, {"deadline": EARLY, "earlier_share": np.float32(0.5)}),
+    "mixed": (MIXED, {"deadline": EARLY}),
     "learnability": (ADAPTIVE, {}),
     "failure": (FAILURE, {"floor": np.float32(0.4)}),
 }

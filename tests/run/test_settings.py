@@ -189,12 +189,10 @@ def test_import_needs_neither_jax_nor_hydra():
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),
-        (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give sequential, mixed or "
-         "adaptive."),
+        (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give one of sequential, "
+         "mixed, adaptive, or extensions=FILE, a file that defines it."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
          "than 0, at most 1."),
-        (["curriculum.mode=mixed", "curriculum.earlier_share=1"], "curriculum.earlier_share is 1: "
-         "give more than 0, less than 1."),
         (["stage=s6", "stage.side=5"], "stage.side is 5: give 0.4 to 4."),
         (["stage=s6", "stage.side=[0.8,5]"], "stage.side is [0.8,5]: give 0.4 to 4."),
         (["stage=s6", "stage.side=[1.2,1]"], "stage.side is [1.2,1]: give the lower number first."),
@@ -210,9 +208,6 @@ def test_import_needs_neither_jax_nor_hydra():
          "an option of adaptive, so give learnability or mode=adaptive."),
         (["curriculum.mode=mixed", "curriculum.floor=0.2"], "curriculum.floor is 0.2, but mode is "
          "mixed: floor is an option of adaptive, so give 0.1 or mode=adaptive."),
-        (["curriculum.mode=sequential", "curriculum.earlier_share=0.1"], "curriculum.earlier_share "
-         "is 0.1, but mode is sequential: earlier_share is an option of mixed, so give 0.2 or "
-         "mode=mixed."),
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
          "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
          "keep or mode=sequential."),

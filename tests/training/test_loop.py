@@ -163,24 +163,23 @@ def test_the_curriculum_visits_every_stage_within_one_trace(tiny_config: TrainCo
 
 @pytest.mark.slow
 def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: TrainConfig) -> None:
-    options = CurriculumConfig(mode="mixed", threshold=1.0, earlier_share=0.5)
+    options = CurriculumConfig(mode="mixed", threshold=1.0)
     program, schedule = programs.load(_six(tiny_config, options))
     chunk, init = _traced_once(program), jax.jit(partial(loop.init, program))
     schedule = schedule._replace(deadline=np.array([3, 8, *[NEVER] * 4], np.int32))
     _, metrics = chunk(schedule, init(schedule), np.int32(20))
     np.testing.assert_array_equal(metrics["stage"][:20], np.repeat([0, 1, 2], [3, 5, 12]))
-    # Half of the 8 arenas are on the third stage, and a quarter on each stage before it. Episodes
-    # that began before the last promotion have ended after a step limit.
-    np.testing.assert_allclose(metrics["weights"][19], [0.25, 0.25, 0.5, 0, 0, 0], rtol=1e-6)
+    # Four fifths of the 8 arenas are on the third stage, and a tenth on each stage before it.
+    # Episodes that began before the last promotion have ended after a step limit.
+    np.testing.assert_allclose(metrics["weights"][19], [0.1, 0.1, 0.8, 0, 0, 0], rtol=1e-6)
     assert metrics["mix"][12:20].sum(axis=0).tolist()[3:] == [0, 0, 0]
     assert (metrics["mix"][12:20].sum(axis=1) == 8).all()
     # The points that place eight arenas on stages move with each cohort, so each stage's mean
     # number of arenas is within one of its share.
-    np.testing.assert_allclose(metrics["mix"][12:20].mean(axis=0)[:3], [2, 2, 4], atol=1)
+    np.testing.assert_allclose(metrics["mix"][12:20].mean(axis=0)[:3], [0.8, 0.8, 6.4], atol=1)
     # Other numbers throughout the schedule need no second trace.
     other = schedule._replace(
         threshold=np.float32(0.1),
-        earlier_share=np.float32(0.9),
         cohort_updates=np.int32(3),
         deadline=np.arange(1, 7, dtype=np.int32),
         stages=schedule.stages._replace(robots=np.array([1, 2, 3, 4, 5, 5], np.int32)),
