@@ -60,7 +60,7 @@ class MujocoArena:
         """
         if settings.task.arrival != "latch":
             raise ConfigError(f"task.arrival is {settings.task.arrival}: give latch.")
-        for name in ("arrival", "robot_contact", "path_progress"):
+        for name in ("arrival", "path_progress"):
             weight = getattr(settings.task.reward, name)
             if weight:
                 raise ConfigError(f"task.reward.{name} is {weight}: give 0.")

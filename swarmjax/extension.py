@@ -64,7 +64,6 @@ class RewardTerm(Piece):
         "proximity",
         "arrival",
         "contact",
-        "robot_contact",
         "touching",
         "step_penalty",
     )

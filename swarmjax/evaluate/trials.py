@@ -127,7 +127,6 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     robot = config.robot
     if cell.hull_friction is not None:
         robot = replace(robot, hull_friction=cell.hull_friction)
-        realism = replace(realism, hull_friction=None)
     return replace(
         config,
         robot=robot,

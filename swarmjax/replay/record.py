@@ -209,15 +209,13 @@ def _cut(
     over = frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
     before = frames.arrived[:-1]
-    active, arrives = arrival.drives(task.arrival, before), ~before & frames.arrived[1:]
-    if task.arrival == "hold":
-        arrives = np.broadcast_to(frames.arrived[1:].all(axis=-1, keepdims=True), before.shape)
+    active, present = arrival.drives(task.arrival, before), np.ones_like(before)
     steps = reward.Step(
         distance_before=frames.distance[:-1],
         distance=frames.distance[1:],
         infrared=frames.ray[1:],
         sensor_range=task.sensor_range,
-        arrives=arrives,
+        arrives=arrival.arrives(task.arrival, before, frames.arrived[1:], present),
         contact_begins=np.diff(frames.contacts, axis=0),
         touching=frames.touching[1:],
         outside=~before,

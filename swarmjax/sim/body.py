@@ -26,14 +26,12 @@ class Chassis(NamedTuple):
       track: [R] distance between the points where the wheels grip the floor, m, or None.
       mass: [R] kg, or None.
       friction: [R] friction between wheels and floor, or None.
-      hull_friction: [] friction between hulls and everything that they touch, or None.
     """
 
     wheel_radius: Array | None = None
     track: Array | None = None
     mass: Array | None = None
     friction: Array | None = None
-    hull_friction: Array | None = None
 
 
 AS_BUILT = Chassis()
@@ -150,19 +148,6 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
         "body_invweight0": (bodies, model.body_invweight0[bodies] / ratio[:, None, None]),
         "dof_invweight0": (dofs, model.dof_invweight0[dofs] / ratio[:, None]),
     }
-
-
-def rub(friction: Array, rows: Rows) -> tuple[Any, Array]:
-    """Returns the change of hull friction: rows of `pair_friction`, and their new values.
-
-    Args:
-      friction: [] friction between hulls and everything that they touch.
-      rows: rows of the robots.
-
-    Returns:
-      The value of an entry of `Changes`.
-    """
-    return (rows.hulls[:, None], [0, 1]), friction * np.ones((len(rows.hulls), 2), np.float32)
 
 
 def _hull_pairs(model: mujoco.MjModel, robots: int) -> np.ndarray:

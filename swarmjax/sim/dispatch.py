@@ -98,7 +98,7 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
     if solver == "swarm" and body == "wheeled" and rubs:
         raise ConfigError(
             "sim.solver is swarm, but robot.body is wheeled and its hulls have friction "
-            "(robot.hull_friction or realism.hull_friction): give mjx or auto, or leave both out."
+            "(robot.hull_friction): give mjx or auto, or leave it out."
         )
     if solver != "auto":
         return solver

@@ -18,7 +18,7 @@ MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; largest magnitude of `normal`
 class Stream(enum.IntEnum):
     """Purpose of a random number; values must never change, so that old levels still replay.
 
-    Streams up to `HULL_FRICTION` are drawn once per episode, at clock 0; the others at each
+    Streams up to `LAYOUT` are drawn once per episode, at clock 0; the others at each
     control step.
     """
 
@@ -42,7 +42,6 @@ class Stream(enum.IntEnum):
     OBSERVATION_LATENCY = 17
     ARENA_SIDE = 18
     LAYOUT = 19
-    HULL_FRICTION = 20
     INFRARED = 32
     SPEED_NOISE = 33
     STALL = 34

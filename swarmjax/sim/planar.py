@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, rub, scale_mass
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, Servos, scale_mass
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.drive import body_velocity
 from swarmjax.sim.geometry import add_hull
@@ -175,8 +175,6 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
-    if chassis.hull_friction is not None:
-        changes["pair_friction"] = rub(chassis.hull_friction, rows)
     acts = rows.actuators
     if acts.size == 0:
         return changes

@@ -9,12 +9,9 @@ from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.sim.config import (
     FASTEST_WHEEL,
     FRICTION_REASON,
-    HULL_FRICTION_REASON,
     LARGEST_HULL,
     LEAST,
-    LEAST_HULL_FRICTION,
     MOST_FRICTION,
-    MOST_HULL_FRICTION,
 )
 
 _LONGEST = 3600.0  # s; a training episode takes 16 s, and no pause in it may be longer
@@ -122,15 +119,6 @@ class RealismConfig(Section):
             LEAST,
             MOST_FRICTION,
             reason=FRICTION_REASON,
-        ),
-    )
-    hull_friction: tuple[float, float] | None = field(
-        default=None,
-        metadata=about(
-            "friction of all hulls on hulls, boxes and walls; per episode",
-            LEAST_HULL_FRICTION,
-            MOST_HULL_FRICTION,
-            reason=HULL_FRICTION_REASON,
         ),
     )
     speed_noise: float | None = field(

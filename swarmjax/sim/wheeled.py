@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.body import Body, Changes, Chassis, Rows, rub, scale_mass
+from swarmjax.sim.body import Body, Changes, Chassis, Rows, scale_mass
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, SPIN, add_geom, add_hull
 from swarmjax.sim.planar import servo_share
@@ -153,8 +153,9 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
-    if chassis.friction is not None or chassis.hull_friction is not None:
-        changes["pair_friction"] = _frictions(chassis, rows)
+    if chassis.friction is not None:
+        grip = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
+        changes["pair_friction"] = ((rows.grips[..., None], [0, 1]), grip)
     if chassis.wheel_radius is not None:
         changes["geom_size"] = ((rows.wheel_geoms, 0), chassis.wheel_radius)
         changes["body_pos"] = ((rows.wheel_bodies, 2), chassis.wheel_radius)
@@ -162,19 +163,6 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
         beyond = 0.5 * chassis.track[:, None] - _INNER_EDGE
         changes["geom_pos"] = ((rows.wheel_geoms, 1), beyond * _SIDES)
     return changes
-
-
-def _frictions(chassis: Chassis, rows: Rows) -> tuple[Any, Array]:
-    """Returns the change of friction: wheels on the floor, hulls on everything, or both."""
-    if chassis.friction is None:
-        return rub(chassis.hull_friction, rows)
-    grip = chassis.friction[:, None, None].repeat(2, axis=1).repeat(2, axis=2)
-    if chassis.hull_friction is None:
-        return (rows.grips[..., None], [0, 1]), grip
-    (hulls, both), hull = rub(chassis.hull_friction, rows)
-    xp = grip.__array_namespace__()
-    pairs = np.concatenate([rows.grips.reshape(-1, 1), hulls])
-    return (pairs, both), xp.concatenate([grip.reshape(-1, 2), hull])
 
 
 WHEELED = Body(

@@ -31,6 +31,28 @@ def arrived(rule: Arrival, before: Any, within: Any) -> Any:
     return within if rule == "hold" else before | within
 
 
+def arrives(rule: Arrival, before: Any, arrived: Any, present: Any) -> Any:
+    """Returns which robots' episodes end in a control step because they arrive.
+
+    Args:
+      rule: the arrival rule of the task.
+      before: [..., R] whether the robot had arrived before the control step, bool.
+      arrived: [..., R] whether the robot has arrived after it, as `arrived` returns it.
+      present: [..., R] whether the robot is present, bool.
+
+    Returns:
+      [..., R] bool; with `hold`, all robots that are present or none.
+    """
+    if rule == "hold":
+        return present & complete(arrived, present)[..., None]
+    return arrived & ~before
+
+
+def complete(arrived: Any, present: Any) -> Any:
+    """Returns [...] whether all robots that are present have arrived."""
+    return (arrived | ~present).all(axis=-1)
+
+
 def drives(rule: Arrival, before: Any) -> Any:
     """Returns which robots obey their commands in a control step.
 

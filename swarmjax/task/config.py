@@ -37,9 +37,6 @@ class RewardConfig(Section):
         metadata=_weight("once, on arrival; with arrival=hold, when all robots have arrived"),
     )
     contact: float = field(default=-0.2, metadata=_weight("per contact event of any kind"))
-    robot_contact: float = field(
-        default=0.0, metadata=_weight("added to contact, per contact event with another robot")
-    )
     touching: float = field(
         default=0.0, metadata=_weight("per control step in which the robot touches something")
     )

@@ -162,9 +162,7 @@ def load(
 
 def chassis(factors: Factors) -> Chassis:
     """Returns the chassis of the robots in an episode."""
-    return Chassis(
-        factors.wheel_radius, factors.track, factors.mass, factors.friction, factors.hull_friction
-    )
+    return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
 
 
 def mount(factors: Factors) -> infrared.Mount | None:

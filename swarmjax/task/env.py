@@ -298,7 +298,9 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, level, state.factors, _speak(world, action, active))
-    arrived, arrives, complete = _arrive(world, state, active, sight)
+    rule, within = world.task.arrival, active & (sight.distance <= world.task.target_radius)
+    arrived = arrival.arrived(rule, state.arrived, within)
+    arrives = arrival.arrives(rule, state.arrived, arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
@@ -334,26 +336,9 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         terminated=arrives,
         truncated=active & ~arrives & (timeout | ~sound),
         valid=valid,
-        done=complete | timeout | ~sound,
+        done=arrival.complete(arrived, level.present) | timeout | ~sound,
         sound=sound,
     )
-
-
-def _arrive(
-    world: World, state: EnvState, active: Array, sight: Sight
-) -> tuple[Array, Array, Array]:
-    """Finds out who has arrived.
-
-    Returns:
-      [R] robots that have arrived, [R] robots whose episode ends at this step because they did,
-      and [] whether all robots of the level have arrived.
-    """
-    rule = world.task.arrival
-    within = active & (sight.distance <= world.task.target_radius)
-    arrived = arrival.arrived(rule, state.arrived, within)
-    complete = jnp.all(arrived | ~state.level.present)
-    arrives = state.level.present & complete if rule == "hold" else within
-    return arrived, arrives, complete
 
 
 def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:

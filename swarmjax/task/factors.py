@@ -37,7 +37,6 @@ class Factors(NamedTuple):
       max_wheel_speed: [..., R] rad/s.
       mass: [..., R] kg.
       friction: [..., R] friction between wheels and floor.
-      hull_friction: [...] friction between hulls and everything that they touch.
       infrared_noise: [..., R, K] factor on the noise of the response.
       infrared_gain: [..., R, K] factor on the reflected part of the response.
       infrared_offset: [..., R, K] constant error of the reading, counts.
@@ -58,7 +57,6 @@ class Factors(NamedTuple):
     max_wheel_speed: Array | None = None
     mass: Array | None = None
     friction: Array | None = None
-    hull_friction: Array | None = None
     infrared_noise: Array | None = None
     infrared_gain: Array | None = None
     infrared_offset: Array | None = None
@@ -128,8 +126,7 @@ def draw(
     - Gain, offset, yaw and position: each sensor draws its own.
     - Reflectance: each obstacle and each robot draws its own. All walls of the arena share one
       reflectance.
-    - Friction: each robot draws the friction of its wheels on the floor. All hulls, boxes and walls
-      of an episode share one friction.
+    - Friction: each robot draws the friction of its wheels on the floor.
 
     Args:
       seed: [...] uint32, one per episode.
@@ -150,7 +147,6 @@ def draw(
         max_wheel_speed=uniform(realism.max_wheel_speed, Stream.MAX_WHEEL_SPEED, robots),
         mass=uniform(realism.mass, Stream.MASS, robots),
         friction=uniform(realism.friction, Stream.FRICTION, robots),
-        hull_friction=uniform(realism.hull_friction, Stream.HULL_FRICTION),
         infrared_noise=uniform(realism.infrared_noise, Stream.INFRARED_NOISE, *sensors),
         infrared_gain=uniform(realism.infrared_gain, Stream.INFRARED_GAIN, *sensors),
         infrared_offset=normal(realism.infrared_offset, Stream.INFRARED_OFFSET, *sensors),
@@ -200,9 +196,8 @@ def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius and a hull friction that no draw exceeds.
+      The robot, with a wheel radius that no draw exceeds.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     half = 0.5 * (realism.wheel_mismatch or 0.0)
-    rubs = realism.hull_friction[1] if realism.hull_friction else robot.hull_friction
-    return replace(robot, wheel_radius=most * (1.0 + half * noise.MOST), hull_friction=rubs)
+    return replace(robot, wheel_radius=most * (1.0 + half * noise.MOST))

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from swarmjax.extension import RewardTerm
 from swarmjax.sim.dispatch import least, pieces
-from swarmjax.sim.gaps import KINDS
 from swarmjax.task.config import RewardConfig
 
 Array = Any
@@ -89,11 +88,6 @@ def contact(step: Step) -> Array:
     return _number(step, step.contact_begins.sum(axis=-1))
 
 
-def robot_contact(step: Step) -> Array:
-    """Returns 1 if a contact with another robot began in this step."""
-    return _number(step, step.contact_begins[..., KINDS.index("robot")])
-
-
 def touching(step: Step) -> Array:
     """Returns 1 if the robot touches something of any kind after the step.
 
@@ -124,7 +118,6 @@ TERMS: dict[str, Callable[[Step], Array]] = {
     "proximity": proximity,
     "arrival": arrival,
     "contact": contact,
-    "robot_contact": robot_contact,
     "touching": touching,
     "step_penalty": step_penalty,
 }

@@ -5,7 +5,6 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import SUITE_SEED, CellConfig, read_suite
 from swarmjax.sim.config import RobotConfig
-from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
@@ -93,9 +91,6 @@ def test_a_cell_has_a_friction_of_hulls_of_its_own(tiny: Suite) -> None:
     )
     found = [trials.specialise(typed, cell).robot.hull_friction for cell in tiny.cells]
     assert found == [1.0, 0.5, 1.0]
-    drawn = replace(typed, realism=RealismConfig(hull_friction=(0.5, 1.0)))
-    mine = [trials.specialise(drawn, cell).realism.hull_friction for cell in tiny.cells]
-    assert mine == [(0.5, 1.0), None, (0.5, 1.0)]
 
 
 def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:

@@ -436,7 +436,6 @@ def _robots_apart(one: np.ndarray, other: np.ndarray, least: float = 0.0) -> lis
     [
         ("mass", (0.13, 0.20)),
         ("friction", (0.1, 0.1)),
-        ("hull_friction", (0.5, 0.5)),
         ("wheel_radius", (0.0198, 0.0198)),
         ("wheel_mismatch", 0.02),
         ("track", (0.057, 0.057)),
@@ -715,19 +714,6 @@ def test_friction_leaves_the_push_of_a_blocked_robot_as_it_is(tmp_path: Path) ->
         # Without friction the robot is thrown back no further than it sinks in. In 60 steps the
         # robot settles to 1e-3.
         assert impulse == pytest.approx(20 * 0.16 * SPEED * math.cos(angle), rel=2e-3)
-
-
-@BODIES
-def test_each_episode_has_the_friction_that_was_drawn(tmp_path: Path, body: BodyName) -> None:
-    robot, realism = RobotConfig(body=body), RealismConfig(hull_friction=(0.2, 0.6))
-    judge = _judge(tmp_path, _stage(), AHEAD, robot=robot, realism=realism)
-    levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, episode) for episode in range(2)]
-    arenas = engine_c.start(judge, levels)
-    drawn = arenas.factors.hull_friction
-    assert drawn is not None
-    assert drawn[0] != drawn[1]
-    for mine, expected in zip(arenas.model, drawn, strict=True):
-        np.testing.assert_array_equal(mine.pair_friction[judge.ids.robots.hulls, :2], expected)
 
 
 @BODIES

@@ -23,7 +23,6 @@ WEIGHTS = RewardConfig(
     proximity=-0.01,
     arrival=0.5,
     contact=-0.3,
-    robot_contact=-0.2,
     touching=-0.25,
     step_penalty=-1e-4,
 )

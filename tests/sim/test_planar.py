@@ -128,17 +128,6 @@ def test_actuators_follow_the_chassis() -> None:
             np.testing.assert_allclose(found, getattr(alone, field), rtol=ROUNDING, err_msg=field)
 
 
-def test_the_friction_of_hulls_follows_the_chassis() -> None:
-    robot, size = RobotConfig(hull_friction=0.8), SIZE._replace(robots=ROBOTS)
-    built = model.build(robot, size, STEP).compile()
-    rows = model.ids(built, size).robots
-    drawn = Chassis(hull_friction=np.float32(0.25))  # exact in float32
-    place, values = PLANAR.changes(drawn, rows, robot, built)["pair_friction"]
-    built.pair_friction[place] = values
-    alone = model.build(dataclasses.replace(robot, hull_friction=0.25), size, STEP).compile()
-    np.testing.assert_allclose(built.pair_friction, alone.pair_friction, rtol=ROUNDING)
-
-
 def test_a_blocked_robot_turns_with_the_grip_of_its_wheels_times_half_the_track() -> None:
     robot = RobotConfig()
     forward, _, torque = planar._servos(robot, 0.001)[1]

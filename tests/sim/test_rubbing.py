@@ -26,11 +26,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmjax.config import ConfigError
-from swarmjax.sim import gaps, model
-from swarmjax.sim.body import Chassis
+from swarmjax.sim import gaps
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.fast import rubbing_jax
-from swarmjax.sim.wheeled import WHEELED
 
 Impl = Literal["jax", "warp"]
 Solver = Literal["auto", "mjx", "swarm"]
@@ -186,38 +184,6 @@ def test_a_robot_slides_along_a_wall_by_coulombs_law(
     assert (_along_wall(angle) > 0.06 * FULL * math.sin(angle)) == slides
     # After 1.28 s the speed is 0.03 % off its steady value, and the heading has crept by 1e-5 rad.
     assert pressed[engine][row] == pytest.approx(_along_wall(angle), rel=1e-3)
-
-
-@pytest.mark.parametrize("impl", ["jax", "warp"])
-@pytest.mark.slow
-def test_an_episode_may_have_a_friction_of_its_own(impl: Impl) -> None:
-    pose, command = _jams()
-    wheels = np.broadcast_to(wheels_of(command), (20, ARENAS, ROBOTS, 2))
-    rough, smooth = (_engine(impl, RobotConfig(hull_friction=f)) for f in (0.9, 0.3))
-    expected = drive_all(smooth, pose, wheels, DOORWAY, side=SIDE)
-    drawn = Chassis(hull_friction=jnp.float32(0.3))
-    found = drive_all(rough, pose, wheels, DOORWAY, side=SIDE, chassis=drawn)
-    # Both programs compute with the same friction, but XLA may round a constant differently from an
-    # argument.
-    np.testing.assert_allclose(found.pose, expected.pose, atol=1e-6)
-    nominal = drive_all(rough, pose, wheels, DOORWAY, side=SIDE)
-    assert np.abs(nominal.pose - expected.pose).max() > 1e-3
-
-
-def test_the_grip_of_wheels_and_the_friction_of_hulls_are_drawn_side_by_side() -> None:
-    robot, size = RobotConfig(body="wheeled", hull_friction=0.8), model.ArenaSize(2, 1, 0.05)
-    built = model.build(robot, size, 0.016).compile()
-    rows = model.ids(built, size).robots
-    for both in (np, jnp):
-        grip, hull = both.asarray([0.6, 1.1], both.float32), both.float32(0.3)
-        changed = WHEELED.changes(Chassis(friction=grip, hull_friction=hull), rows, robot, built)
-        place, values = changed["pair_friction"]
-        found = built.pair_friction.copy()
-        found[place] = values
-        expected = built.pair_friction.copy()
-        expected[rows.grips, :2] = np.array([0.6, 1.1], np.float32)[:, None, None]
-        expected[rows.hulls, :2] = np.float32(0.3)
-        np.testing.assert_array_equal(found, expected)
 
 
 @given(

@@ -31,7 +31,6 @@ RANGES: dict[str, Any] = {
     "max_wheel_speed": (6.0, 6.9),
     "mass": (0.13, 0.20),
     "friction": (0.6, 1.2),
-    "hull_friction": (0.2, 0.6),
     "infrared_noise": (0.6, 3.5),
     "infrared_gain": (0.7, 1.3),
     "infrared_period": (0.01, 0.05),
@@ -66,7 +65,6 @@ SHAPES = {
     "max_wheel_speed": (ROBOTS,),
     "mass": (ROBOTS,),
     "friction": (ROBOTS,),
-    "hull_friction": (),
     "infrared_noise": (ROBOTS, SENSORS),
     "infrared_gain": (ROBOTS, SENSORS),
     "infrared_offset": (ROBOTS, SENSORS),
@@ -303,7 +301,6 @@ def test_no_draw_exceeds_the_largest_wheels() -> None:
     most = factors.largest(ROBOT, _realism(wheel_radius=(0.0198, 0.02), wheel_mismatch=0.1))
     assert most.wheel_radius == pytest.approx(0.02 * 1.288405, rel=1e-6)
     radius = np.asarray(_draw(_realism(wheel_mismatch=0.1)).wheel_radius)
-    assert factors.largest(ROBOT, _realism(hull_friction=(0.2, 0.6))).hull_friction == 0.6
     limit = factors.largest(ROBOT, _realism(wheel_mismatch=0.1)).wheel_radius
     assert 0.02 * (1 + 0.05 * 3.5) < radius.max() < limit
 

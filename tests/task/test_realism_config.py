@@ -47,7 +47,6 @@ REAL = {
     "max_wheel_speed": (6.0, 6.9),
     "mass": (0.13, 0.20),
     "friction": (0.6, 1.2),
-    "hull_friction": None,  # no source tells how it varies
     "speed_noise": 0.05,
     "speed_quantisation": "epuck2",
     "action_latency": (0, 2),
@@ -60,7 +59,7 @@ REAL = {
     "neighbour_distance_noise": 0.015,
     "neighbour_bearing_noise": 0.0873,  # 5 degrees: 5 * 3.1416 / 180 = 0.08727
 }
-FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time", "hull_friction"})
+FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time"})
 LOADS = [load_train, lambda words: load_levels(EvaluateConfig, ["policy=p", *words])]
 
 
@@ -253,7 +252,6 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["robot.motor_lag=-0.1"], "robot.motor_lag is -0.1: give 0 to 1."),
         # Impossible draws.
         (["realism.friction=[0,1]"], "realism.friction is [0,1]: give 0.001 to 10."),
-        (["realism.hull_friction=[0,1]"], "realism.hull_friction is [0,1]: give 0.1 to 2."),
         (["realism.max_wheel_speed=[0,6]"], "realism.max_wheel_speed is [0,6]: give 0.001 "
          "to 1000."),
         (["realism.speed_noise=-0.05"], "realism.speed_noise is -0.05: give 0 to 1."),

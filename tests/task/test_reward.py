@@ -47,7 +47,6 @@ def step() -> reward.Step:
         ("proximity", [0, 1, 1, 0]),  # counted once for all rays; a full ray sees nothing
         ("arrival", [0, 0, 1, 0]),
         ("contact", [0, 1, 2, 0]),
-        ("robot_contact", [0, 1, 1, 0]),  # robots are the first of the three kinds
         ("touching", [0, 1, 1, 1]),  # counted once for all kinds, even if no contact begins
         ("step_penalty", [1, 1, 1, 1]),
     ],
