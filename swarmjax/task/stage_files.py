@@ -1,13 +1,18 @@
 """Finds the stages that a choice of configs/stage/ names: one stage, a sequence or a grid."""
 
-import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from swarmjax.config import ConfigError, Section, build, files, section, show, to_dict
+from swarmjax.config import ConfigError, Section, build, files, show, to_dict
 from swarmjax.config.reading import called
 from swarmjax.task.stage_config import GridConfig, complete
+
+# The files that name several stages: their key, and what a message calls them and advises.
+_SEVERAL = {
+    "sequence": "a curriculum: choose one stage, as in stage=s6",
+    "grid": "a grid: give its axes, as in stage.grid.side=[0.7,1.0]",
+}
 
 
 def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
@@ -21,10 +26,14 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
       ConfigError: the file, its sequence or its grid is invalid, or the file does not take these
         keys.
     """
-    if not _is_grid(choice):
-        return _listed(stage, choice)
-    grid = build(GridConfig, _grid(stage, choice), "stage.grid.")
-    return [to_dict(cell) for cell in grid.stages()]
+    several = _several(choice)
+    if several is None:
+        return [_named(stage, choice)]
+    for key in stage.keys() - {several}:
+        raise ConfigError(f"stage.{key} cannot be given for {choice}, {_SEVERAL[several]}.")
+    if several == "sequence":
+        return _sequence(stage["sequence"], choice)
+    return [to_dict(cell) for cell in build(GridConfig, stage["grid"], "stage.grid.").stages()]
 
 
 def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
@@ -37,25 +46,25 @@ def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     Raises:
       ConfigError: the choice names several stages, or is invalid.
     """
-    if _is_grid(choice):
-        raise ConfigError(f"stage is {choice}, a grid: give one stage, as in stage=s6.")
-    stages = _listed(stage, choice)
-    if _is_sequence(choice):
-        raise ConfigError(
-            f"stage is {choice}, a curriculum: give one stage, as in stage={stages[-1]['name']}."
-        )
-    return stages[0]
+    if several := _several(choice):
+        what = _SEVERAL[several].partition(":")[0]
+        raise ConfigError(f"stage is {choice}, {what}: give one stage, as in stage=s6.")
+    return _named(stage, choice)
 
 
-def read_stage(choice: str) -> dict[str, Any]:
+def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
     """Reads a file of configs/stage/ that is a single stage.
+
+    Args:
+      choice: the name of the file.
+      key: the key that names it, for messages.
 
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
     """
-    files.check_choice("stage", choice, "stage")
-    if _is_sequence(choice) or _is_grid(choice):
-        raise ConfigError(f"stage is {choice}, which names several stages: give single stages.")
+    files.check_choice("stage", choice, key)
+    if _several(choice):
+        raise ConfigError(f"{key} is {choice}, which names several stages: give single stages.")
     return _named(files.read_choice("stage", choice), choice)
 
 
@@ -98,51 +107,25 @@ def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[st
             )
 
 
-def _listed(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
-    """Returns the stage of a file, or the stages of its sequence."""
-    if not _is_sequence(choice):
-        return [_named(stage, choice)]
-    names = section.convert(tuple[str, ...], stage["sequence"], "stage.sequence")
-    names = typing.cast(tuple[str, ...], names)
-    if not names:
+def _several(choice: str) -> str | None:
+    """Returns the key of `_SEVERAL` that a file of configs/stage/ has, if it has one."""
+    found = files.read_choice("stage", choice)
+    return next((key for key in _SEVERAL if key in found), None)
+
+
+def _sequence(stages: Any, choice: str) -> list[dict[str, Any]]:
+    """Returns the stages of a sequence: each entry is a stage, or the name of its file."""
+    if not isinstance(stages, Sequence) or isinstance(stages, str):
+        raise ConfigError(f"stage.sequence is {show(stages)}: give a list, as in [s1,s2].")
+    if not stages:
         raise ConfigError("stage.sequence is []: give at least one stage.")
-    _refuse_others(
-        stage, choice, "sequence", f"a curriculum: choose one stage, as in stage={names[-1]}"
-    )
     folder = Path(choice).parent if files.is_path(choice) else Path()
-    return [_member(files.beside(folder, name)) for name in names]
-
-
-def _grid(stage: dict[str, Any], choice: str) -> dict[str, Any]:
-    """Returns the axes of a grid."""
-    _refuse_others(stage, choice, "grid", "a grid: give its axes, as in stage.grid.side=[0.7,1.0]")
-    return stage["grid"]
-
-
-def _is_sequence(choice: str) -> bool:
-    """Returns whether a file of configs/stage/ is a sequence of other stages."""
-    return "sequence" in files.read_choice("stage", choice)
-
-
-def _is_grid(choice: str) -> bool:
-    """Returns whether a file of configs/stage/ is a grid of stages."""
-    return "grid" in files.read_choice("stage", choice)
-
-
-def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -> None:
-    """Refuses keys of a single stage in a file that names several stages."""
-    for key in stage.keys() - {only}:
-        raise ConfigError(f"stage.{key} cannot be given for {choice}, {advice}.")
-
-
-def _member(name: str) -> dict[str, Any]:
-    """Reads one stage of a curriculum."""
-    files.check_choice("stage", name, "stage.sequence")
-    if _is_sequence(name):
-        raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
-    if _is_grid(name):
-        raise ConfigError(f"stage.sequence names {name}, a grid: give single stages.")
-    return _named(files.read_choice("stage", name), name)
+    return [
+        complete(dict(each))
+        if isinstance(each, Mapping)
+        else read_stage(files.beside(folder, str(each)), "stage.sequence")
+        for each in stages
+    ]
 
 
 def name_of(choice: str) -> str:

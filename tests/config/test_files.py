@@ -127,11 +127,13 @@ def test_a_stage_is_one_file(own_configs):
     assert [stage.robots for stage in train.stage] == [2, 4]
 
 
-def test_a_path_in_a_sequence_is_meant_from_the_folder_of_its_file(tmp_path):
+def test_a_sequence_takes_names_paths_beside_its_file_and_stages(tmp_path):
     (tmp_path / "wide.yaml").write_text("name: wide\nrobots: 4\nside: 3\n")
-    (tmp_path / "mine.yaml").write_text("sequence: [s1, wide.yaml]\n")
+    (tmp_path / "mine.yaml").write_text(
+        "sequence: [s1, wide.yaml, {name: own, robots: 1, side: 2}]\n"
+    )
     train = load_train([f"stage={tmp_path / 'mine.yaml'}"])
-    assert [stage.name for stage in train.stage] == ["s1", "wide"]
+    assert [stage.name for stage in train.stage] == ["s1", "wide", "own"]
 
 
 def test_a_grid_is_one_file(own_configs):

@@ -161,8 +161,10 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
         (["stage.sequence=s1"], "stage.sequence is 's1': give a list, as in [s1,s2]."),
         (["stage.sequence=[s1,s1]"], "stage names s1 more than once: give each stage once."),
-        (["stage.sequence=[curriculum]"], "stage.sequence names curriculum, a curriculum itself: "
-         "give single stages."),
+        (["stage.sequence=[curriculum]"], "stage.sequence is curriculum, which names several "
+         "stages: give single stages."),
+        (["stage.sequence=[{robots: 2, side: 1}]"], "stage.name is missing and has "
+         "no default: give it."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
          "robots, side, obstacles, obstacle_size, level, layout, map, cell, breadth, gap, width, "
          "depth, length, radius, apart, cells."),
@@ -232,7 +234,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
          "is [0.4,0.5], too small for every cell of the grid: even the fewest robots and obstacles "
          "need 0.58."),
-        (["stage.sequence=[s1,grid]"], "stage.sequence names grid, a grid: give single stages."),
+        (["stage.sequence=[s1,grid]"], "stage.sequence is grid, which names several stages: "
+         "give single stages."),
         # Checks across keys.
         (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
          "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
