@@ -176,10 +176,6 @@ def load(
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
     room.check(stages, spacing, chosen.drawings)
-    if chosen.drawings:
-        drawn = task_stage.stack(stages, chosen.drawings)
-        names = [stage.name for stage in stages]
-        extended.check_levels(chosen.drawings, drawn, spacing, names)
     return World(
         robot=robot,
         task=task,
@@ -238,7 +234,12 @@ def reset(world: World, level: Level) -> EnvState:
         arrived=arrived,
         distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
-        episode=_no_episode(robots),
+        episode=Episode(
+            reward=jnp.zeros(robots),
+            contacts=jnp.zeros((robots, len(sim_gaps.KINDS)), jnp.int32),
+            sensed=jnp.zeros(robots, jnp.int32),
+            moving=jnp.zeros(robots, jnp.int32),
+        ),
         path=_begin_path(world, level),
     )
 
@@ -269,16 +270,6 @@ def look_around(world: World, state: EnvState) -> Array:
     return surroundings.look(pose, state.level, state.arrived, to_go, waypoint)
 
 
-def _no_episode(robots: int) -> Episode:
-    """Returns the zero sums of a new episode."""
-    return Episode(
-        reward=jnp.zeros(robots),
-        contacts=jnp.zeros((robots, len(sim_gaps.KINDS)), jnp.int32),
-        sensed=jnp.zeros(robots, jnp.int32),
-        moving=jnp.zeros(robots, jnp.int32),
-    )
-
-
 def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeStep]:
     """Advances one arena by one control step.
 
@@ -306,9 +297,18 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         world.electronics, memory, state.factors, sight, clock, jnp
     )
     begins, apart = _count_contacts(world, state, pose)
-    earned = _earned(world, state, sight, arrives, begins & active[:, None], apart == 0.0)
-    path, earned = _follow_path(world, state, pose, earned)
-    earned = _fill(world, earned, state, action, pose)
+    after = replace(
+        state,
+        sim=data,
+        memory=memory,
+        clock=clock,
+        arrived=arrived,
+        distance=sight.distance,
+        apart=apart,
+        path=_follow_path(world, state, pose),
+    )
+    begun = begins & active[:, None]
+    earned = _reward_step(world, state, after, sight, arrives, begun, pose, action)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
@@ -318,19 +318,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     seen = jnp.where(sound, seen, state.observation)
     episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
     timeout = clock >= world.task.step_limit
-    new = replace(
-        state,
-        sim=data,
-        memory=memory,
-        observation=seen,
-        clock=clock,
-        arrived=arrived,
-        distance=sight.distance,
-        apart=apart,
-        episode=episode,
-        path=path,
-    )
-    return new, TimeStep(
+    return replace(after, observation=seen, episode=episode), TimeStep(
         observation=seen,
         reward=gained,
         terminated=arrives,
@@ -349,36 +337,47 @@ def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, 
     return begins & level.present[:, None], apart
 
 
-def _earned(
+def _reward_step(
     world: World,
-    state: EnvState,
+    before: EnvState,
+    after: EnvState,
     sight: Sight,
     arrives: Array,
     begins: Array,
-    touching: Array,
+    pose: Array,
+    action: Array,
 ) -> reward.Step:
-    """Assembles the input of the built-in reward terms."""
-    return reward.Step(
-        state.distance,
-        sight.distance,
-        sight.ray,
-        world.task.sensor_range,
-        arrives,
-        begins,
-        None if world.task.arrival == "latch" else ~state.arrived,
-        touching,
+    """Assembles the input of the reward terms."""
+    step = reward.Step(
+        distance_before=before.distance,
+        distance=after.distance,
+        infrared=sight.ray,
+        sensor_range=world.task.sensor_range,
+        arrives=arrives,
+        contact_begins=begins,
+        outside=None if world.task.arrival == "latch" else ~before.arrived,
+        touching=after.apart == 0.0,
+    )
+    if before.path is not None and after.path is not None:
+        step = step._replace(path_before=before.path.distance, path=after.path.distance)
+    if not world.terms:
+        return step
+    return step._replace(
+        outside=~before.arrived,
+        pose_before=physics.poses(world.physics, before.sim),
+        pose=pose,
+        action=jnp.clip(action[:, : sim_drive.COMMAND_SIZE], -1.0, 1.0),
+        present=before.level.present,
+        clock=after.clock,
     )
 
 
-def _follow_path(
-    world: World, state: EnvState, pose: Array, earned: reward.Step
-) -> tuple[geodesic.Path | None, reward.Step]:
-    """Measures the shortest paths from poses [R, 3], and adds them to the reward's input."""
+def _follow_path(world: World, state: EnvState, pose: Array) -> geodesic.Path | None:
+    """Measures the shortest paths from poses [R, 3], if the reward uses them."""
     if state.path is None:
-        return None, earned
+        return None
     fast = dispatch.load_paths(world.physics.engine.impl)
-    path = geodesic.go_on(state.path, pose[:, :2], state.level, world.robot.hull_radius, fast)
-    return path, earned._replace(path_before=state.path.distance, path=path.distance)
+    return geodesic.go_on(state.path, pose[:, :2], state.level, world.robot.hull_radius, fast)
 
 
 def _is_finite(numbers: Array, counted: Array) -> Array:
@@ -448,24 +447,6 @@ def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | N
     hidden = hearing.hidden(pose, level.obstacle, jnp)
     found = hearing.reachable(pose, level.present, hidden, said, settings, jnp)
     return sight._replace(heard=found)
-
-
-def _fill(
-    world: World, step: reward.Step, state: EnvState, action: Array, pose: Array
-) -> reward.Step:
-    """Adds the fields that only extension terms read, if there are such terms."""
-    if not world.terms:
-        return step
-    if world.action_size > sim_drive.COMMAND_SIZE:  # reward terms receive only the motion command
-        action = action[:, : sim_drive.COMMAND_SIZE]
-    return step._replace(
-        outside=~state.arrived,
-        pose_before=physics.poses(world.physics, state.sim),
-        pose=pose,
-        action=jnp.clip(action, -1.0, 1.0),
-        present=state.level.present,
-        clock=state.clock + 1,
-    )
 
 
 def _tally(

@@ -14,14 +14,13 @@ from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import LevelDrawing, Observation, Piece, RewardTerm
 from swarmjax.sim.gaps import KINDS
-from swarmjax.task import level
+from swarmjax.task import electronics, level
+from swarmjax.task.electronics import Sight
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.observation import View
 from swarmjax.task.pieces import Chosen
 from swarmjax.task.reward import Step
-from swarmjax.task.stage import Stage, select
-
-_TRIED = 8  # levels of a drawing to check before the program is built
+from swarmjax.task.stage import Stage
 
 
 def look(own: Sequence[Observation], view: View) -> Array:
@@ -60,56 +59,6 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
         pairs = zip(piece.function(drawn, key), found, strict=True)
         found = Level(*(jnp.where(mine, own, other) for own, other in pairs))
     return level.park(found, jnp)
-
-
-def check_levels(
-    drawings: Sequence[LevelDrawing], stages: Stage, spacing: Spacing, names: Sequence[str]
-) -> None:
-    """Refuses drawings that place robots or targets outside the walls, or hulls that overlap.
-
-    Args:
-      drawings: extension drawings.
-      stages: [S], as NumPy arrays.
-      spacing: sizes.
-      names: [S] names of the stages.
-
-    Raises:
-      ConfigError: a drawn level is invalid; the message names the piece, the stage and the fault.
-    """
-    count = level.uniform_count(spacing)
-    uniforms = np.random.default_rng(0).random((_TRIED, count), dtype=np.float32)
-    for index, name in enumerate(names):
-        stage = select(stages, index)
-        if not stage.drawing:
-            continue
-        piece = drawings[int(stage.drawing) - 1]
-        for each in uniforms:
-            found = redraw(piece, level.sample(each, stage, spacing, np))
-            problem = _problem(found, spacing)
-            if problem:
-                raise ConfigError(f"{label(piece)}, drawn for stage {name}, {problem}.")
-
-
-def _problem(found: Level, spacing: Spacing) -> str | None:
-    """Describes the fault of a level; None if it has none."""
-    start, target = found.start[found.present], found.target[found.present]
-    if not all(np.isfinite(field).all() for field in (start, target, found.obstacle)):
-        return "holds a number that is not finite: return numbers"
-    room = 0.5 * float(found.side) - spacing.hull_radius
-    for what, place in (("starts", start[:, :2]), ("has its target", target)):
-        outside = np.flatnonzero(np.abs(place).max(axis=-1) > room)
-        if outside.size:
-            x, y = place[outside[0]]
-            return (
-                f"robot {outside[0]} {what} at ({x:.3g}, {y:.3g}) m: stay within {room:.3g} m of "
-                "the middle, which keeps the hull inside the walls"
-            )
-    apart = np.linalg.norm(start[:, None, :2] - start[None, :, :2], axis=-1)
-    close = np.argwhere(np.triu(apart < 2.0 * spacing.hull_radius, 1))
-    if close.size:
-        first, second = close[0]
-        return f"robots {first} and {second} overlap at the start: keep two hulls apart"
-    return None
 
 
 def redraw(piece: LevelDrawing, drawn: Level) -> Level:
@@ -168,30 +117,38 @@ def check(chosen: Chosen, robots: int, obstacles: int) -> None:
     Raises:
       ConfigError: a piece returns something else; the message says what it should return.
     """
+    drawn, there, whole = (
+        _level(robots, obstacles),
+        _shape(robots, dtype=bool),
+        _shape(dtype=jnp.int32),
+    )
+    sight = Sight(_shape(robots, epuck.SENSORS), None, _shape(robots), _shape(robots))
+    seen = electronics.view(sight, drawn.start, drawn, there, whole)
     for piece in chosen.observations:
         shapes = [(robots, piece.size)] + ([(robots,)] if piece.size == 1 else [])
-        _check_floats(piece, shapes, _view(robots, obstacles))
+        _check_floats(piece, shapes, seen)
     for piece, _ in chosen.terms:
         _check_floats(piece, [(robots,)], _step(robots))
     for piece in chosen.drawings:
-        _check_drawing(piece, _level(robots, obstacles))
+        _check_drawing(piece, drawn)
 
 
 def _check_floats(piece: Piece, shapes: list[tuple[int, ...]], argument: Any) -> None:
     """Refuses a piece that does not return floats of one of these shapes."""
-    found = trace(piece, argument)
+    found = _trace(piece, argument)
+    if not isinstance(found, jax.ShapeDtypeStruct):
+        what = type(found).__name__
+    elif found.shape in shapes and jnp.issubdtype(found.dtype, jnp.floating):
+        return
+    else:
+        what = f"{found.dtype} of shape {list(found.shape)}"
     wanted = f"float numbers of shape {' or '.join(str(list(shape)) for shape in shapes)}"
-    if not hasattr(found, "shape") or not hasattr(found, "dtype"):
-        raise ConfigError(f"{label(piece)} returns {type(found).__name__}: return {wanted}.")
-    if found.shape not in shapes or not jnp.issubdtype(found.dtype, jnp.floating):
-        raise ConfigError(
-            f"{label(piece)} returns {found.dtype} of shape {list(found.shape)}: return {wanted}."
-        )
+    raise ConfigError(f"{label(piece)} returns {what}: return {wanted}.")
 
 
 def _check_drawing(piece: LevelDrawing, drawn: Level) -> None:
     """Refuses a drawing that does not return a valid level."""
-    found = trace(piece, drawn, jax.eval_shape(jax.random.key, 0))
+    found = _trace(piece, drawn, jax.eval_shape(jax.random.key, 0))
     if not isinstance(found, Level):
         raise ConfigError(
             f"{label(piece)} returns {type(found).__name__}: return level._replace(...)."
@@ -204,16 +161,8 @@ def _check_drawing(piece: LevelDrawing, drawn: Level) -> None:
             )
 
 
-def trace(piece: Piece, *arguments: Any) -> Any:
-    """Returns the shapes that a piece returns.
-
-    Args:
-      piece: the piece.
-      arguments: shapes of its arguments.
-
-    Raises:
-      ConfigError: the piece raises an exception; the message repeats it in one sentence.
-    """
+def _trace(piece: Piece, *arguments: Any) -> Any:
+    """Returns the shapes that a piece returns."""
     with explained(f"{label(piece)} fails"):
         return jax.eval_shape(piece.function, *arguments)
 
@@ -229,36 +178,20 @@ def _shape(*shape: int, dtype: Any = jnp.float32) -> Any:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
-def _view(robots: int, obstacles: int) -> View:
-    drawn, whole = _level(robots, obstacles), _shape(dtype=jnp.int32)
-    return View(
-        pose=drawn.start,
-        target=drawn.target,
-        distance=_shape(robots),
-        bearing=_shape(robots),
-        infrared=_shape(robots, epuck.SENSORS),
-        present=drawn.present,
-        arrived=drawn.present,
-        side=drawn.side,
-        obstacle=drawn.obstacle,
-        obstacle_present=drawn.obstacle_present,
-        clock=whole,
-    )
-
-
 def _step(robots: int) -> Step:
-    there = _shape(robots, dtype=jnp.bool_)
+    there, kinds = _shape(robots, dtype=bool), _shape(robots, len(KINDS), dtype=bool)
+    distance, pose = _shape(robots), _shape(robots, 3)
     return Step(
-        distance_before=_shape(robots),
-        distance=_shape(robots),
+        distance_before=distance,
+        distance=distance,
         infrared=_shape(robots, epuck.SENSORS),
         sensor_range=epuck.SENSOR_RANGE,
         arrives=there,
-        contact_begins=_shape(robots, len(KINDS), dtype=jnp.bool_),
-        touching=_shape(robots, len(KINDS), dtype=jnp.bool_),
+        contact_begins=kinds,
+        touching=kinds,
         outside=there,
-        pose_before=_shape(robots, 3),
-        pose=_shape(robots, 3),
+        pose_before=pose,
+        pose=pose,
         action=_shape(robots, 2),
         present=there,
         clock=_shape(dtype=jnp.int32),
@@ -268,10 +201,10 @@ def _step(robots: int) -> Step:
 def _level(robots: int, obstacles: int) -> Level:
     return Level(
         side=_shape(),
-        present=_shape(robots, dtype=jnp.bool_),
+        present=_shape(robots, dtype=bool),
         start=_shape(robots, 3),
         target=_shape(robots, 2),
-        obstacle_present=_shape(obstacles, dtype=jnp.bool_),
+        obstacle_present=_shape(obstacles, dtype=bool),
         obstacle=_shape(obstacles, 5),
         seed=_shape(dtype=jnp.uint32),
     )

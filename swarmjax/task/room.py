@@ -1,4 +1,4 @@
-"""Checks that the map or the layout of a stage has room for its robots."""
+"""Checks that maps, layouts and an extension's level drawings place robots where they fit."""
 
 from collections.abc import Sequence
 
@@ -6,54 +6,51 @@ import numpy as np
 
 from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
-from swarmjax.task import level
+from swarmjax.task import extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.placement import MARGIN
 from swarmjax.task.stage_config import StageConfig
 
-_TRIED = 16  # levels of a map to check
-_ROUNDING = 1.0 / 1024  # m; x and y of points are rounded to units of 1/4096 m
+_TRIED = 16  # levels of a stage to check
 _BESIDE = 0.003  # m, between the hull and each side of the narrowest door
 
 
 def check(
     stages: Sequence[StageConfig], spacing: Spacing, drawings: Sequence[LevelDrawing] = ()
 ) -> None:
-    """Refuses maps and layouts in which robots or targets would overlap.
+    """Refuses stages in which robots or targets would overlap, or lie outside the walls.
 
     Args:
-      stages: stages to run.
+      stages: stages to run. Random and fixed levels always fit.
       spacing: sizes.
       drawings: level drawings of an extension.
 
     Raises:
-      ConfigError: a stage has too little room; the message says for what, and how to fix it.
+      ConfigError: a stage or a drawing has a fault; the message says which.
     """
+    uniforms = np.random.default_rng(0).random(
+        (_TRIED, level.uniform_count(spacing)), dtype=np.float32
+    )
     for stage in stages:
-        if stage.map:
-            _check_map(stage, _sample(stage, spacing, drawings), spacing)
-        elif stage.kind is not None:
-            _check_gap(stage, spacing)
-            _check_layout(stage, _sample(stage, spacing, drawings), spacing)
-
-
-def _sample(stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> list[Level]:
-    """Draws some levels of a stage."""
-    count = level.uniform_count(spacing)
-    uniforms = np.random.default_rng(0).random((_TRIED, count), dtype=np.float32)
-    arrays = task_stage.single(stage, drawings)
-    return [level.sample(each, arrays, spacing, np) for each in uniforms]
-
-
-def _check_map(stage: StageConfig, drawn: Sequence[Level], spacing: Spacing) -> None:
-    for area, problem in _AREAS.items():
-        if any(problem(each, spacing) for each in drawn):
-            letters = len(stage.drawn_map.pair) if stage.drawn_map else 0
-            raise ConfigError(
-                f"stage {stage.name}: map has no room for {stage.robots - letters} robots in "
-                f"{area}: give more or larger cells there, or fewer robots."
-            )
+        own = next((piece for piece in drawings if piece.name == stage.level), None)
+        if own is None and not stage.map and stage.kind is None:
+            continue
+        _check_gap(stage, spacing)
+        arrays = task_stage.single(stage, drawings)
+        for each in uniforms:
+            drawn = level.sample(each, arrays, spacing, np)
+            if own is not None:
+                drawn = extended.redraw(own, drawn)
+            problem = _problem(drawn, spacing, targets=own is None)
+            if problem and own is not None:
+                raise ConfigError(
+                    f"{extended.label(own)}, drawn for stage {stage.name}: {problem}."
+                )
+            if problem:
+                raise ConfigError(
+                    f"stage {stage.name}: level={stage.level} has no room for {stage.robots} "
+                    f"robots, since {problem}: give fewer robots, or more space."
+                )
 
 
 def _check_gap(stage: StageConfig, spacing: Spacing) -> None:
@@ -68,43 +65,19 @@ def _check_gap(stage: StageConfig, spacing: Spacing) -> None:
             )
 
 
-def _check_layout(stage: StageConfig, drawn: Sequence[Level], spacing: Spacing) -> None:
-    problems = (_hulls_overlap, _starts_arrived)
-    if any(problem(each, spacing) for each in drawn for problem in problems):
-        raise ConfigError(
-            f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots in an "
-            f"arena of {show(stage.side)} m: give fewer robots, or a larger side."
-        )
-
-
-def _hulls_overlap(drawn: Level, spacing: Spacing) -> bool:
-    places = (drawn.target[drawn.present], drawn.start[drawn.present, :2])
-    return min(map(_least, places)) < 2.0 * spacing.hull_radius
-
-
-def _targets_overlap(drawn: Level, spacing: Spacing) -> bool:
-    places = drawn.target[drawn.present]
-    return _least(places) < 2.0 * (spacing.hull_radius + MARGIN) - _ROUNDING
-
-
-def _starts_overlap(drawn: Level, spacing: Spacing) -> bool:
-    places = drawn.start[drawn.present, :2]
-    return _least(places) < 2.0 * spacing.hull_radius + MARGIN - _ROUNDING
-
-
-def _starts_arrived(drawn: Level, spacing: Spacing) -> bool:
-    apart = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1)[drawn.present]
-    return bool(np.any(apart < spacing.target_radius))
-
-
-def _least(places: np.ndarray) -> float:
-    """Returns the least distance between two of the places, m."""
-    apart = np.linalg.norm(places[:, None] - places[None, :], axis=-1)
-    return float(np.min(apart[np.triu_indices(len(places), 1)], initial=np.inf))
-
-
-_AREAS = {
-    "T, beside targets with letters": _targets_overlap,
-    "S, beside starts with letters": _starts_overlap,
-    "S, apart from their targets": _starts_arrived,
-}
+def _problem(drawn: Level, spacing: Spacing, *, targets: bool) -> str | None:
+    """Describes the fault of a level, if it has one; an extension's targets may overlap."""
+    start, target = drawn.start[drawn.present], drawn.target[drawn.present]
+    if not all(np.isfinite(field).all() for field in (start, target, drawn.obstacle)):
+        return "a number is not finite"
+    room = 0.5 * float(drawn.side) - spacing.hull_radius
+    for what, place in (("starts", start[:, :2]), ("has its target", target)):
+        outside = np.flatnonzero(np.abs(place).max(axis=-1) > room)
+        if outside.size:
+            return f"robot {outside[0]} {what} {show(room)} m or more off the middle of the arena"
+        apart = np.linalg.norm(place[:, None] - place[None, :], axis=-1)
+        close = np.argwhere(np.triu(apart < 2.0 * spacing.hull_radius, 1))
+        if close.size and (what == "starts" or targets):
+            return f"robots {close[0][0]} and {close[0][1]} overlap where each {what}"
+    arrived = np.linalg.norm(start[:, :2] - target, axis=-1) < spacing.target_radius
+    return "a robot starts within its target" if targets and arrived.any() else None

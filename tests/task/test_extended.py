@@ -121,12 +121,11 @@ def test_observations_may_be_left_out() -> None:
         ("@level_drawing\ndef ring(level, key): return level._replace(target=level.start)",
          "level ring returns target as float32 of shape [4, 3]: return float32 of shape [4, 2]."),
         ("@level_drawing\ndef ring(level, key): return level._replace(target=level.target + 9)",
-         "level ring, drawn for stage ring, robot 0 has its target at ("),
+         "level ring, drawn for stage ring: robot 0 has its target 0.4"),
         ("@level_drawing\ndef ring(level, key): return level._replace(start=0 * level.start)",
-         "level ring, drawn for stage ring, robots 0 and 1 overlap at the start: keep two hulls "
-         "apart."),
+         "level ring, drawn for stage ring: robots 0 and 1 overlap where each starts."),
         ("@level_drawing\ndef ring(level, key): return level._replace(start=level.start + jnp.nan)",
-         "level ring, drawn for stage ring, holds a number that is not finite: return numbers."),
+         "level ring, drawn for stage ring: a number is not finite."),
         ("@level_drawing\ndef ring(level, key): return level._replace(obstacle=2 * level.obstacle)",
          "level ring changes the half edges of obstacles: leave obstacle[:, 3:] as it is, and give "
          "the stage's obstacle_size."),

@@ -342,7 +342,11 @@ def _change(name: str, **changed: Any) -> None:
         ("bay", {"robots": 3}, "robots is 3, but level=bay has room for 2: give at most that."),
         ("fence", {"length": 0.75}, "breadth is 0.8, too small for level=fence with robots=5 "),
         ("crowd", {"robots": 80}, "side is 1.2, too small for level=crowd with robots=80 and "),
-        ("circle", {"radius": 0.15}, "stage world_circle: level=circle has no room for 16 robots "),
+        (
+            "circle",
+            {"radius": 0.15},
+            "stage world_circle: level=circle has no room for 16 robots, ",
+        ),
     ],
 )
 def test_refuses_numbers_without_room(name: str, changed: dict[str, Any], said: str) -> None:

@@ -140,15 +140,16 @@ def test_a_map_goes_with_its_level(given: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "robots", "area"),
+    ("text", "robots", "where"),
     [
-        ("S...T S...T S...T", 4, "T, beside targets with letters"),
-        ("S..TTT S..TTT ...TTT", 4, "S, beside starts with letters"),
+        ("SSST SSS. SSS.", 4, "has its target"),
+        ("S..TTT S..TTT ...TTT", 6, "starts"),
     ],
 )
-def test_refuses_areas_without_room(text: str, robots: int, area: str) -> None:
+def test_refuses_areas_without_room(text: str, robots: int, where: str) -> None:
     said = refusal(room.check, [_stage(text, robots)], SPACING)
-    assert said.startswith(f"stage drawn: map has no room for {robots} robots in {area}: ")
+    assert said.startswith(f"stage drawn: level=map has no room for {robots} robots, since robots")
+    assert said.endswith(f" overlap where each {where}: give fewer robots, or more space.")
 
 
 def test_areas_with_room_are_taken() -> None:
