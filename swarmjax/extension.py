@@ -114,14 +114,14 @@ class Network(Piece):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Curriculum(Piece):
+class OwnCurriculum(Piece):
     """A curriculum: `(Schedule) -> Curriculum`, both of `swarmjax.curriculum.engine`."""
 
     kind: ClassVar[str] = "curriculum"
     taken: ClassVar[tuple[str, ...]] = ("sequential", "mixed", "adaptive")
 
 
-KINDS = (RewardTerm, Observation, LevelDrawing, Network, Curriculum)
+KINDS = (RewardTerm, Observation, LevelDrawing, Network, OwnCurriculum)
 
 
 def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
@@ -185,9 +185,9 @@ def network(module: type) -> Network:
     return Network(name=_snake(module.__name__), function=module)
 
 
-def curriculum(function: Callable) -> Curriculum:
+def curriculum(function: Callable) -> OwnCurriculum:
     """Turns a function into a curriculum; `curriculum.mode` selects it."""
-    return Curriculum(name=function.__name__, function=function)
+    return OwnCurriculum(name=function.__name__, function=function)
 
 
 def _snake(name: str) -> str:
@@ -210,7 +210,7 @@ class Extensions(NamedTuple):
     observations: tuple[Observation, ...] = ()
     levels: tuple[LevelDrawing, ...] = ()
     networks: tuple[Network, ...] = ()
-    curricula: tuple[Curriculum, ...] = ()
+    curricula: tuple[OwnCurriculum, ...] = ()
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 from swarmjax.config import ConfigError, Section, about, show
 from swarmjax.config.section import check_options
-from swarmjax.extension import Curriculum
+from swarmjax.extension import OwnCurriculum
 
 MODES = ("sequential", "mixed", "adaptive")
 _STEPWISE, _ADAPTIVE = MODES[:2], MODES[2:]
@@ -103,7 +103,7 @@ class CurriculumConfig(Section):
         check_options(self, _READ_BY)
 
 
-def check_mode(mode: str, own: Sequence[Curriculum]) -> None:
+def check_mode(mode: str, own: Sequence[OwnCurriculum]) -> None:
     """Refuses a `curriculum.mode` that is neither built in nor a curriculum of an extension."""
     names = [*MODES, *(piece.name for piece in own)]
     if mode not in names:

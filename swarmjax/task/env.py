@@ -146,7 +146,7 @@ def load(
     arenas: int = 1,
     extensions: Extensions = NONE,
 ) -> World:
-    """Builds the model and puts it on the device.
+    """Builds the world that `reset` and `step` run in, and puts the model on the device.
 
     Args:
       stages: stages to run; the model is compiled for their largest obstacle.
@@ -156,9 +156,6 @@ def load(
       sim: physics engine, and largest numbers of robots and obstacles.
       arenas: largest number of arenas stepped together; only Warp uses it.
       extensions: extension pieces; `task` names the ones to use.
-
-    Returns:
-      The world that `reset` and `step` run in.
 
     Raises:
       ConfigError: Warp is selected but not installed, a solver cannot run here, or a piece of an
@@ -240,28 +237,24 @@ def reset(world: World, level: Level) -> EnvState:
             sensed=jnp.zeros(robots, jnp.int32),
             moving=jnp.zeros(robots, jnp.int32),
         ),
-        path=_begin_path(world, level),
+        path=_measure_path(world, level),
     )
 
 
-def _begin_path(world: World, level: Level) -> geodesic.Path | None:
-    """Finds the shortest paths if the reward uses them."""
+def _measure_path(
+    world: World, level: Level, before: geodesic.Path | None = None, pose: Array | None = None
+) -> geodesic.Path | None:
+    """Measures the shortest paths from the starts or from poses [R, 3], if the reward uses them."""
     if not world.task.reward.path_progress:
         return None
-    fast = dispatch.load_paths(world.physics.engine.impl)
-    return geodesic.begin(level, world.robot.hull_radius, fast)
+    hull, fast = world.robot.hull_radius, dispatch.load_paths(world.physics.engine.impl)
+    if before is None or pose is None:
+        return geodesic.begin(level, hull, fast)
+    return geodesic.go_on(before, pose[:, :2], level, hull, fast)
 
 
 def look_around(world: World, state: EnvState) -> Array:
-    """Lists the surroundings of each robot, for a critic in training.
-
-    Args:
-      world: the compiled environment.
-      state: the arena.
-
-    Returns:
-      [R, P], as `surroundings.look` returns it.
-    """
+    """Lists the surroundings [R, P] of each robot for a critic, as `surroundings.look` does."""
     pose = physics.poses(world.physics, state.sim)
     to_go, waypoint = state.distance, state.level.target
     if state.path is not None:
@@ -305,7 +298,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         arrived=arrived,
         distance=sight.distance,
         apart=apart,
-        path=_follow_path(world, state, pose),
+        path=_measure_path(world, level, state.path, pose),
     )
     begun = begins & active[:, None]
     earned = _reward_step(world, state, after, sight, arrives, begun, pose, action)
@@ -355,29 +348,20 @@ def _reward_step(
         sensor_range=world.task.sensor_range,
         arrives=arrives,
         contact_begins=begins,
-        outside=None if world.task.arrival == "latch" else ~before.arrived,
         touching=after.apart == 0.0,
+        outside=~before.arrived,
     )
     if before.path is not None and after.path is not None:
         step = step._replace(path_before=before.path.distance, path=after.path.distance)
     if not world.terms:
         return step
     return step._replace(
-        outside=~before.arrived,
         pose_before=physics.poses(world.physics, before.sim),
         pose=pose,
         action=jnp.clip(action[:, : sim_drive.COMMAND_SIZE], -1.0, 1.0),
         present=before.level.present,
         clock=after.clock,
     )
-
-
-def _follow_path(world: World, state: EnvState, pose: Array) -> geodesic.Path | None:
-    """Measures the shortest paths from poses [R, 3], if the reward uses them."""
-    if state.path is None:
-        return None
-    fast = dispatch.load_paths(world.physics.engine.impl)
-    return geodesic.go_on(state.path, pose[:, :2], state.level, world.robot.hull_radius, fast)
 
 
 def _is_finite(numbers: Array, counted: Array) -> Array:

@@ -27,14 +27,13 @@ class Step(NamedTuple):
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
         robots are within their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
-      outside: [R] whether the robot had not yet arrived when the step began. None if this holds for
-        all robots that get a reward, as with `task.arrival=latch`.
       touching: [R, 3] whether the robot touches something of each kind after the step.
+      outside: [R] whether the robot had not yet arrived when the step began.
       path_before: [R] distance along the shortest path to the target, m. None for a reward without
         a path weight, and for terms of an extension.
       path: [R] the same distance after the step, m.
       pose_before: [R, 3] x (m), y (m), yaw (rad). This field and the fields below are for
-        extensions only. For extensions, `outside` is set under both arrival rules.
+        extensions only.
       pose: [R, 3] the pose after the step.
       action: [R, 2] action, clipped to -1..1; -1 and 1 are the ends of each command's range.
       present: [R] whether the robot is present, bool.
@@ -47,8 +46,8 @@ class Step(NamedTuple):
     sensor_range: float
     arrives: Array
     contact_begins: Array
-    outside: Any = None
-    touching: Any = None
+    touching: Array
+    outside: Array
     path_before: Any = None
     path: Any = None
     pose_before: Any = None
@@ -72,7 +71,7 @@ def proximity(step: Step) -> Array:
     """Returns 1 if one or more rays are shorter than the sensor's range (equation 3)."""
     xp = step.infrared.__array_namespace__()
     parts = (step.infrared[..., i] for i in pieces(step.infrared.shape[-1], xp))
-    return _before_arrival(step, least(parts, step.sensor_range, xp) < step.sensor_range)
+    return _number(step, step.outside & (least(parts, step.sensor_range, xp) < step.sensor_range))
 
 
 def arrival(step: Step) -> Array:
@@ -98,13 +97,7 @@ def touching(step: Step) -> Array:
 
 def step_penalty(step: Step) -> Array:
     """Returns 1 for every control step that begins before arrival."""
-    xp = step.distance.__array_namespace__()
-    return _before_arrival(step, xp.ones_like(step.distance, dtype=bool))
-
-
-def _before_arrival(step: Step, holds: Array) -> Array:
-    """Returns 1 for robots of which something holds and that had not arrived, else 0, [R]."""
-    return _number(step, holds if step.outside is None else holds & step.outside)
+    return _number(step, step.outside)
 
 
 def _number(step: Step, values: Array) -> Array:

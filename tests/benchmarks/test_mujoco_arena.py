@@ -57,7 +57,8 @@ def test_rewards_are_those_of_the_task(settings: EvaluateConfig) -> None:
         active = ~before.outcome.arrived[0]
         begun = (after.outcome.contacts - before.outcome.contacts)[0]
         rays = after.observation[0, :, INFRARED]  # ideal sensors give metres
-        step = reward.Step(start, end, rays, 0.04, after.outcome.arrived[0] & active, begun)
+        arrives = after.outcome.arrived[0] & active
+        step = reward.Step(start, end, rays, 0.04, arrives, begun, begun > 0, active)
         expected = np.where(active, reward.total(step, weights), 0.0)
         # The arena computes in float64, and the expected reward is in float32. A ray that is
         # exactly as long as its range may be rounded either way.

@@ -157,6 +157,7 @@ def _step(before: float, now: float, *, was_there: bool) -> reward.Step:
         sensor_range=0.04,
         arrives=jnp.zeros(1, bool),
         contact_begins=jnp.zeros((1, 3), bool),
+        touching=jnp.zeros((1, 3), bool),
         outside=jnp.array([not was_there]),
     )
 

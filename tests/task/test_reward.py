@@ -34,6 +34,7 @@ def step() -> reward.Step:
         arrives=jnp.array([False, False, True, False]),
         contact_begins=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 0]], bool),
         touching=jnp.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], bool),
+        outside=jnp.ones(4, bool),
         path_before=jnp.array([0.75, 0.5, 0.0625, 0.5]),
         path=jnp.array([0.5, 0.625, 0.03125, 0.5]),
     )
@@ -102,7 +103,8 @@ def test_no_weight_no_reward(step: reward.Step) -> None:
 
 def test_progress_telescopes() -> None:
     distance = np.random.default_rng(0).uniform(0.0, 1.0, (21, 3)).astype(np.float32)
-    rest = (jnp.zeros((3, 8)), RANGE, jnp.zeros(3, bool), jnp.zeros((3, 3), bool))
+    none = jnp.zeros((3, 3), bool)
+    rest = (jnp.zeros((3, 8)), RANGE, none[0], none, none, none[0])
     total = np.zeros(3)
     for before, now in itertools.pairwise(distance):
         total += reward.progress(reward.Step(jnp.asarray(before), jnp.asarray(now), *rest))
