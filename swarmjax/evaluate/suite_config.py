@@ -110,7 +110,7 @@ def _cell(cell: Any, folder: Path) -> Any:
     stage = cell.get("stage") if isinstance(cell, Mapping) else None
     if isinstance(stage, str):
         stage = files.beside(folder, stage)
-        return {**cell, "stage": stage_files.pick_one(stage_files.read_stage(stage), stage)}
+        return {**cell, "stage": stage_files.read_stage(stage)}
     if isinstance(stage, Mapping):
         return {**cell, "stage": complete({"name": cell.get("name"), **stage})}
     return cell

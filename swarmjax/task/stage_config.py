@@ -5,7 +5,7 @@ import itertools
 import math
 import re
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -22,24 +22,17 @@ from swarmjax.task.placement import UNITS
 # passage. In a passage, one robot has 13 mm to spare on either side. Along the walls, a border of
 # half a passage stays free.
 DISC = 0.15  # m, edge of the square around the disc of a start or a target
-
-
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
-
-
 FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
 
-
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
-_OR = "or the name of an extension's level drawing"
-
-
 _MOST_OBSTACLES = 64
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
+_Length = float | tuple[float, float] | None
 
 
 def complete(stage: dict[str, Any]) -> dict[str, Any]:
-    """Fills in the settings of a stage that follow from its map or layout.
+    """Fills in the settings of a stage that follow from its map, if it has one.
 
     Args:
       stage: plain data; `map` is a text or a list of its rows.
@@ -52,26 +45,16 @@ def complete(stage: dict[str, Any]) -> dict[str, Any]:
     """
     text = stage.get("map")
     if not text:
-        return _with_walls(stage)
+        return stage
     rows = text.strip().split() if isinstance(text, str) else text
-    rows = section.convert(tuple[str, ...], rows, "stage.map")
+    rows = typing.cast(tuple[str, ...], section.convert(tuple[str, ...], rows, "stage.map"))
     cell = section.convert(float, stage.get("cell", StageConfig.cell), "stage.cell")
     try:
-        found = _read_map(typing.cast(tuple[str, ...], rows), typing.cast(float, cell))
+        found = _read_map(rows, typing.cast(float, cell))
     except ConfigError as error:
         raise ConfigError(f"stage {stage.get('name')}: {error}") from None
-    said = {"side": found.side, "obstacles": len(found.wall), "level": "map"}
-    return {**stage, "map": list(typing.cast(tuple[str, ...], rows)), **said}
-
-
-def _with_walls(stage: dict[str, Any]) -> dict[str, Any]:
-    """Fills in the number of walls of a stage with a layout, unless it is given."""
-    level = stage.get("level")
-    if not isinstance(level, str) or level not in LAYOUTS or "obstacles" in stage:
-        return stage
-    cells = section.convert(int | None, stage.get("cells"), "stage.cells")
-    kind = Kind(level, typing.cast(int | None, cells) or 0, bool(stage.get("breadth")))
-    return {**stage, "obstacles": kind.walls}
+    derived = {"side": found.side, "obstacles": len(found.wall), "level": "map"}
+    return {**stage, "map": list(rows), **derived}
 
 
 @functools.lru_cache(maxsize=64)
@@ -85,8 +68,9 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     return found
 
 
-_Length = float | tuple[float, float] | None
-_Cell = tuple[int, int, float | tuple[float, float]]  # robots, obstacles, side
+def _length(meaning: str, low: float, high: float) -> dict[str, Any]:
+    """Returns the metadata of a layout's length."""
+    return about(f"{meaning}, m, or a range", low, high)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +82,9 @@ class StageConfig(Section):
     side: float | tuple[float, float] = field(
         metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
-    obstacles: int = field(default=0, metadata=about("obstacles", 0, _MOST_OBSTACLES))
+    obstacles: int = field(
+        default=0, metadata=about("obstacles; set by a layout", 0, _MOST_OBSTACLES)
+    )
     obstacle_size: float = field(
         default=0.10, metadata=about("edge of the square boxes of a random level, m", 0.02, 0.3)
     )
@@ -121,138 +107,107 @@ class StageConfig(Section):
         ),
     )
     cell: float = field(default=0.12, metadata=about("edge of a map cell, m", _SMALLEST_CELL, 1.0))
-
     breadth: _Length = field(
         default=None,
-        metadata=about(
-            "breadth of a layout's arena, m, or a range; null: as long as side", 0.2, 4.0
-        ),
+        metadata=_length("breadth of a layout's arena (null: as long as side)", 0.2, 4.0),
     )
     gap: _Length = field(
-        default=None,
-        metadata=about("free width of a door or a corridor, m, or a range", _SMALLEST_CELL, 1.0),
+        default=None, metadata=_length("free width of a door or a corridor", _SMALLEST_CELL, 1.0)
     )
     width: _Length = field(
         default=None,
-        metadata=about(
-            "free width of a trap, or of a corridor at its bay, m, or a range", 0.1, 2.0
-        ),
+        metadata=_length("free width of a trap, or of a corridor at its bay", 0.1, 2.0),
     )
-    depth: _Length = field(
-        default=None, metadata=about("depth of a trap, m, or a range", 0.05, 2.0)
-    )
-    length: _Length = field(
-        default=None, metadata=about("length of a fence or a bay, m, or a range", 0.1, 4.0)
-    )
+    depth: _Length = field(default=None, metadata=_length("depth of a trap", 0.05, 2.0))
+    length: _Length = field(default=None, metadata=_length("length of a fence or a bay", 0.1, 4.0))
     radius: _Length = field(
-        default=None, metadata=about("radius of the circle of starts, m, or a range", 0.1, 1.9)
+        default=None, metadata=_length("radius of the circle of starts", 0.1, 1.9)
     )
     apart: _Length = field(
         default=None,
-        metadata=about(
-            "distance between targets, or from targets to a door, m, or a range", 0.05, 1
-        ),
+        metadata=_length("distance between targets, or from targets to a door", 0.05, 1),
     )
     cells: int | None = field(default=None, metadata=about("cells along a maze's side", 2, 6))
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
-            raise ConfigError(f"level is {show(self.level)}: give {' or '.join(BUILT_IN)}, {_OR}.")
+            raise ConfigError(
+                f"level is {show(self.level)}: give {' or '.join(BUILT_IN)}, or the name of an "
+                "extension's level drawing."
+            )
         if not re.fullmatch(r"[\w-]+", self.name):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
-        if self.layout == "fence" and self.level != "fixed":
-            raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
-        if self.layout == "fence" and self.obstacles < 1:
-            raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
-        if self.level == "fixed" and isinstance(self.side, tuple):
-            raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
-        self._check_map()
-        self._check_layout()
-        least = 0.0 if self.map or self.level in LAYOUTS else smallest_side(self)
-        if self.sides[0] < least:
+        self._check_fixed()
+        self._check_keys(LAYOUTS.get(self.level))
+        if self.level in LAYOUTS:
+            self._check_size(LAYOUTS[self.level])
+        elif self.level == "map" or self.map:
+            self._check_map()
+        elif self.sides[0] < (least := smallest_side(self)):
             raise ConfigError(
                 f"side is {show(self.side)}, too small for robots={self.robots}, "
                 f"obstacles={self.obstacles}, obstacle_size={show(self.obstacle_size)}: "
                 f"give at least {math.ceil(100 * least) / 100}."
             )
 
+    def _check_fixed(self) -> None:
+        if self.layout == "fence" and self.level != "fixed":
+            raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
+        if self.layout == "fence" and self.obstacles < 1:
+            raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
+        if self.level == "fixed" and isinstance(self.side, tuple):
+            raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
+
     def _check_map(self) -> None:
-        if bool(self.map) != (self.level == "map"):
+        drawn = self.drawn_map
+        if drawn is None or self.level != "map":
             raise ConfigError(
                 f"level is {self.level}, but map is {'given' if self.map else 'missing'}: give "
                 "both level=map and a map, or neither."
             )
-        if not self.map:
-            return
-        drawn = self.drawn_map
-        assert drawn is not None
-        said = {"side": drawn.side, "obstacles": len(drawn.wall)}
-        for key, value in said.items():
-            if getattr(self, key) != value:
-                raise ConfigError(
-                    f"{key} is {show(getattr(self, key))}, but map sets it to {value}: leave {key} "
-                    "out."
-                )
-        self._check_robots(drawn)
-
-    def _check_robots(self, drawn: maps.Map) -> None:
-        pairs = len(drawn.pair)
-        if self.robots < pairs:
+        pairs, areas = len(drawn.pair), len(drawn.start)
+        if self.robots < pairs or (self.robots > pairs and not areas):
+            without = "" if areas else " and no areas S and T"
             raise ConfigError(
-                f"robots is {self.robots}, but map has letters for {pairs}: give at least {pairs}."
-            )
-        if self.robots > pairs and not len(drawn.start):
-            raise ConfigError(
-                f"robots is {self.robots}, but map has letters for {pairs} and no areas S and T: "
-                f"give {pairs}, or add areas S and T for the other robots."
+                f"robots is {self.robots}, but map has letters for {pairs}{without}: give "
+                f"{'at least ' if areas else ''}{pairs}."
             )
 
-    def _check_layout(self) -> None:
-        layout = LAYOUTS.get(self.level)
-        reads = () if layout is None else layout.reads
-        keys = [*NUMBERS, *(["breadth"] if layout is None or layout.square else [])]
-        for key in [*keys, *([] if self.level == "maze" else ["cells"])]:
+    def _check_keys(self, layout: ArenaLayout | None) -> None:
+        """Refuses sizes that the level does not have, and asks for those that it needs."""
+        needed = () if layout is None else layout.reads
+        optional = () if layout is None or layout.square else ("breadth",)
+        for key in (*NUMBERS, "breadth", "cells"):
             given = getattr(self, key)
-            if given is not None and key not in reads:
+            if given is not None and key not in (*needed, *optional):
                 raise ConfigError(
                     f"{key} is {show(given)}, but level is {self.level}, which has none: leave "
                     f"{key} out."
                 )
-            if given is None and key in reads:
-                raise ConfigError(f"{key} is missing: level={self.level} needs {_and(reads)}.")
-        if layout is not None:
-            self._check_size(layout)
+            if given is None and key in needed:
+                raise ConfigError(
+                    f"{key} is missing: level={self.level} needs {' and '.join(needed)}."
+                )
 
     def _check_size(self, layout: ArenaLayout) -> None:
-        if self.level == "maze" and self.cells is None:
-            raise ConfigError("cells is missing: level=maze needs it, as in cells=4.")
+        assert self.kind is not None
+        object.__setattr__(self, "obstacles", self.kind.walls)
         if self.robots > layout.most_robots:
             raise ConfigError(
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
-        assert self.kind is not None
-        if self.obstacles != self.kind.walls:
-            raise ConfigError(
-                f"obstacles is {self.obstacles}, but level={self.level} has {self.kind.walls} "
-                "walls: leave obstacles out."
-            )
-        breadth = _ends(self.breadth or self.side)
         numbers = {key: _ends(getattr(self, key)) for key in layout.reads}
-        demand = Demand(self.robots, self.sides[0], breadth[0], self.cells or 0, numbers)
-        for key, found, least in zip(
-            ("side", "breadth"), (self.sides[0], breadth[0]), layout.least(demand), strict=True
-        ):
+        sizes = {"side": self.sides[0], "breadth": _ends(self.breadth or self.side)[0]}
+        demand = Demand(self.robots, sizes["side"], sizes["breadth"], numbers)
+        for (key, found), least in zip(sizes.items(), layout.least(demand), strict=True):
             if found < least - 1e-9:
+                with_ = " ".join(f"{key}={show(getattr(self, key))}" for key in layout.reads)
                 raise ConfigError(
                     f"{key} is {show(getattr(self, key) or self.side)}, too small for level="
-                    f"{self.level} with robots={self.robots} and {self._said(layout)}: give at "
-                    f"least {math.ceil(100 * least - 1e-6) / 100}."
+                    f"{self.level} with robots={self.robots} and {with_}: give at least "
+                    f"{math.ceil(100 * least - 1e-6) / 100}."
                 )
-
-    def _said(self, layout: ArenaLayout) -> str:
-        keys = [*layout.reads, *(["cells"] if self.cells else [])]
-        return " ".join(f"{key}={show(getattr(self, key))}" for key in keys)
 
     def smallest(self, key: str) -> float | None:
         """Returns the smaller end of a layout's number, m; None if it is not set."""
@@ -331,7 +286,9 @@ def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
     )
 
 
-def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random: bool) -> float:
+def _smallest_side(
+    robots: int, obstacles: int, obstacle_size: float, *, random: bool = True
+) -> float:
     pitch = obstacle_size * math.sqrt(2) + PASSAGE
     area = robots * 2 * DISC**2 + obstacles * pitch**2
     if random:
@@ -342,10 +299,6 @@ def _smallest_side(robots: int, obstacles: int, obstacle_size: float, *, random:
 def _whole(length: float | tuple[float, float]) -> list[int]:
     """Rounds an extent to an even number of units, so that its half is a whole number of units."""
     return [2 * round(end * UNITS / 2) for end in _ends(length)]
-
-
-def _and(words: Sequence[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _ends(side: float | tuple[float, float]) -> tuple[float, float]:
@@ -372,7 +325,7 @@ class GridConfig(Section):
             if not getattr(self, key):
                 raise ConfigError(f"{key} is []: give at least one number.")
         if not self.stages():
-            least = min(self._least(cell) for cell in self._cells())
+            least = _smallest_side(min(self.robots), min(self.obstacles), self.obstacle_size)
             raise ConfigError(
                 f"side is {show(self.side)}, too small for every cell of the grid: even the fewest "
                 f"robots and obstacles need {math.ceil(100 * least) / 100}."
@@ -383,23 +336,18 @@ class GridConfig(Section):
 
         Combinations that do not fit into their arena are left out.
         """
-        cells = [cell for cell in self._cells() if _ends(cell[2])[0] >= self._least(cell)]
+        size = self.obstacle_size
         return tuple(
             StageConfig(
-                name=_cell_name(*cell),
-                robots=cell[0],
-                obstacles=cell[1],
-                side=cell[2],
-                obstacle_size=self.obstacle_size,
+                name=_cell_name(robots, obstacles, side),
+                robots=robots,
+                obstacles=obstacles,
+                side=side,
+                obstacle_size=size,
             )
-            for cell in cells
+            for robots, obstacles, side in itertools.product(self.robots, self.obstacles, self.side)
+            if _ends(side)[0] >= _smallest_side(robots, obstacles, size)
         )
-
-    def _cells(self) -> Iterator[_Cell]:
-        return itertools.product(self.robots, self.obstacles, self.side)
-
-    def _least(self, cell: _Cell) -> float:
-        return _smallest_side(cell[0], cell[1], self.obstacle_size, random=True)
 
 
 def _cell_name(robots: int, obstacles: int, side: float | tuple[float, float]) -> str:

@@ -15,7 +15,7 @@ from swarmjax.task import level, room, stage_files
 from swarmjax.task import stage as task_stage
 from swarmjax.task.layouts import LAYOUTS, maze
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.stage_config import StageConfig, complete
+from swarmjax.task.stage_config import StageConfig
 from tests.sentences import refusal
 
 HULL, REACH = 0.037, 0.05  # m; radii of an e-puck and its zone of arrival
@@ -35,9 +35,7 @@ FAR: dict[str, dict[str, Any]] = {
 
 def _stage(name: str, **changed: Any) -> StageConfig:
     choice = f"world_{name}"
-    given = {**stage_files.pick_one(stage_files.read_stage(choice), choice), **changed}
-    given.pop("obstacles")
-    return build(StageConfig, complete(given))
+    return build(StageConfig, {**stage_files.read_stage(choice), **changed})
 
 
 def _spacing(stage: StageConfig) -> Spacing:
@@ -336,7 +334,7 @@ def _change(name: str, **changed: Any) -> None:
     [
         ("trap", {"side": 0.6}, "side is 0.6, too small for level=trap with robots=1 and width="),
         ("door", {"gap": 0.07}, "gap is 0.07: give 0.08 to 1."),
-        ("maze", {"cells": None}, "cells is missing: level=maze needs it, as in cells=4."),
+        ("maze", {"cells": None}, "cells is missing: level=maze needs cells."),
         ("row", {"apart": None}, "apart is missing: level=row needs gap and apart."),
         ("circle", {"depth": 0.2}, "depth is 0.2, but level is circle, which has none: leave "),
         ("bay", {"robots": 3}, "robots is 3, but level=bay has room for 2: give at most that."),
@@ -361,8 +359,6 @@ def test_refuses_a_door_narrower_than_a_robot() -> None:
     )
 
 
-def test_refuses_another_number_of_walls() -> None:
+def test_a_layout_sets_its_number_of_walls() -> None:
     given = to_dict(_stage("trap")) | {"obstacles": 5}
-    assert refusal(build, StageConfig, given) == (
-        "obstacles is 5, but level=trap has 3 walls: leave obstacles out."
-    )
+    assert build(StageConfig, given).obstacles == 3

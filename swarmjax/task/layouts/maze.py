@@ -115,7 +115,7 @@ def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -
 
 
 def _least(demand: Demand) -> tuple[float, float]:
-    side = demand.cells * (_PASSAGE + THICKNESS / 4096)
+    side = demand.numbers["cells"][1] * (_PASSAGE + THICKNESS / 4096)
     return side, demand.side
 
 
@@ -123,7 +123,7 @@ MAZE = ArenaLayout(
     draw=draw,
     uniforms=lambda robots, cells: 2 * cells * (cells - 1) + cells**2 + 4 * robots,
     walls=lambda cells: 2 * cells * (cells - 1),
-    reads=(),
+    reads=("cells",),
     least=_least,
     square=True,
 )

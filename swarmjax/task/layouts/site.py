@@ -81,14 +81,12 @@ class Demand(NamedTuple):
       robots: number of robots.
       side: smallest extent along x.
       breadth: smallest extent along y.
-      cells: number of cells along a side of a maze.
       numbers: smallest and largest value of each number that the layout reads.
     """
 
     robots: int
     side: float
     breadth: float
-    cells: int
     numbers: Mapping[str, tuple[float, float]]
 
 
@@ -100,7 +98,7 @@ class ArenaLayout(NamedTuple):
       uniforms: takes a number of robots and cells, and returns how many uniform numbers the layout
         takes.
       walls: takes a number of cells (of a maze), and returns the largest number of walls.
-      reads: those `NUMBERS` of a stage that the layout uses.
+      reads: those `NUMBERS` of a stage that the layout uses, or `cells`.
       least: returns the smallest side and breadth with room for a demand, m.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
