@@ -315,8 +315,8 @@ def _read_infrared(
     kind, encoding = electronics.realism.infrared, electronics.encoding
     if kind == "ideal":
         ray = sight.ray
-        if factors.dead is not None:
-            ray = xp.where(factors.dead, electronics.reach, ray)
+        if factors.dead_sensor is not None:
+            ray = xp.where(factors.dead_sensor, electronics.reach, ray)
     else:
         counts = _read_counts(kind, factors, sight, clock, xp)
         if kind == encoding:
@@ -333,7 +333,7 @@ def _read_counts(
 ) -> Array:
     """Samples the counts of sensors with the response `kind`, [..., R, K]."""
     wear = response.Wear(
-        factors.infrared_noise, factors.infrared_gain, factors.infrared_offset, factors.dead
+        factors.infrared_noise, factors.infrared_gain, factors.infrared_offset, factors.dead_sensor
     )
     normal = None
     if factors.infrared_noise is not None:

@@ -43,7 +43,7 @@ class Factors(NamedTuple):
       infrared_yaw: [..., R, K] rad.
       infrared_position: [..., R, K, 2] m, in the robot's frame.
       infrared_period: [..., R] s between samples.
-      dead: [..., R, K] whether the sensor never detects anything.
+      dead_sensor: [..., R, K] whether the sensor never detects anything.
       reflectance_wall: [...] reflectance of all walls.
       reflectance_obstacle: [..., M].
       reflectance_robot: [..., R].
@@ -63,7 +63,7 @@ class Factors(NamedTuple):
     infrared_yaw: Array | None = None
     infrared_position: Array | None = None
     infrared_period: Array | None = None
-    dead: Array | None = None
+    dead_sensor: Array | None = None
     reflectance_wall: Array | None = None
     reflectance_obstacle: Array | None = None
     reflectance_robot: Array | None = None
@@ -71,40 +71,50 @@ class Factors(NamedTuple):
     observation_latency: Array | None = None
 
 
-class _Source(NamedTuple):
-    """Draws the numbers of an episode, each kind from its own random stream."""
+def _uniform(bounds: Any, share: Array, xp: Any) -> Array:
+    """Returns numbers from low..high, within the rounding of float32."""
+    low, high = bounds
+    return low + share * (high - low)
 
-    seed: Array
-    xp: Any
 
-    def uniform(
-        self, bounds: tuple[float, float] | None, stream: Stream, *shape: int
-    ) -> Array | None:
-        """Draws [..., *shape] uniformly from low..high, within the rounding of float32."""
-        if bounds is None:
-            return None
-        low, high = bounds
-        return low + noise.uniform(self.seed, 0, stream, shape, self.xp) * (high - low)
+def _whole(bounds: Any, share: Array, xp: Any) -> Array:
+    """Returns whole numbers from low..high, int32."""
+    low, high = bounds
+    return low + xp.floor(share * (high - low + 1)).astype(xp.int32)
 
-    def whole(self, bounds: tuple[int, int] | None, stream: Stream, *shape: int) -> Array | None:
-        """Draws [..., *shape] integers uniformly from low..high."""
-        if bounds is None:
-            return None
-        low, high = bounds
-        share = noise.uniform(self.seed, 0, stream, shape, self.xp) * (high - low + 1)
-        return low + self.xp.floor(share).astype(self.xp.int32)
 
-    def normal(self, deviation: float | None, stream: Stream, *shape: int) -> Array | None:
-        """Draws [..., *shape] from N(0, deviation)."""
-        if deviation is None:
-            return None
-        return deviation * noise.normal(self.seed, 0, stream, shape, self.xp)
+def _chance(probability: Any, share: Array, xp: Any) -> Array:
+    """Returns booleans that are true with a probability."""
+    return share < probability
 
-    def chance(self, probability: float | None, stream: Stream, *shape: int) -> Array | None:
-        """Draws [..., *shape] booleans that are true with the given probability."""
-        if probability is None:
-            return None
-        return noise.uniform(self.seed, 0, stream, shape, self.xp) < probability
+
+def _normal(deviation: Any, drawn: Array, xp: Any) -> Array:
+    """Returns numbers from N(0, deviation)."""
+    return deviation * drawn
+
+
+# How the factor of each setting is drawn, and its axes: R robots, K sensors, M obstacles, 2 axes.
+# Each has the random stream of its name.
+_DRAWN = {
+    "wheel_radius": (_uniform, "R"),
+    "wheel_mismatch": (_normal, "R"),
+    "track": (_uniform, "R"),
+    "max_wheel_speed": (_uniform, "R"),
+    "mass": (_uniform, "R"),
+    "friction": (_uniform, "R"),
+    "infrared_noise": (_uniform, "RK"),
+    "infrared_gain": (_uniform, "RK"),
+    "infrared_offset": (_normal, "RK"),
+    "infrared_yaw": (_normal, "RK"),
+    "infrared_position": (_normal, "RK2"),
+    "infrared_period": (_uniform, "R"),
+    "dead_sensor": (_chance, "RK"),
+    "reflectance_wall": (_uniform, ""),
+    "reflectance_obstacle": (_uniform, "M"),
+    "reflectance_robot": (_uniform, "R"),
+    "action_latency": (_whole, "R"),
+    "observation_latency": (_whole, "R"),
+}
 
 
 def draw(
@@ -139,53 +149,31 @@ def draw(
     Returns:
       The factors, with the leading axes of `seed`.
     """
-    source, sensors = _Source(xp.asarray(seed, xp.uint32), xp), (robots, epuck.SENSORS)
-    uniform, whole, normal = source.uniform, source.whole, source.normal
-    found = Factors(
-        wheel_radius=_wheel_radius(source, realism, robot, robots),
-        track=uniform(realism.track, Stream.TRACK, robots),
-        max_wheel_speed=uniform(realism.max_wheel_speed, Stream.MAX_WHEEL_SPEED, robots),
-        mass=uniform(realism.mass, Stream.MASS, robots),
-        friction=uniform(realism.friction, Stream.FRICTION, robots),
-        infrared_noise=uniform(realism.infrared_noise, Stream.INFRARED_NOISE, *sensors),
-        infrared_gain=uniform(realism.infrared_gain, Stream.INFRARED_GAIN, *sensors),
-        infrared_offset=normal(realism.infrared_offset, Stream.INFRARED_OFFSET, *sensors),
-        infrared_yaw=normal(realism.infrared_yaw, Stream.INFRARED_YAW, *sensors),
-        infrared_position=normal(realism.infrared_position, Stream.INFRARED_POSITION, *sensors, 2),
-        infrared_period=uniform(realism.infrared_period, Stream.INFRARED_PERIOD, robots),
-        dead=source.chance(realism.dead_sensor, Stream.DEAD_SENSOR, *sensors),
-        reflectance_wall=uniform(realism.reflectance_wall, Stream.REFLECTANCE_WALL),
-        reflectance_obstacle=uniform(
-            realism.reflectance_obstacle, Stream.REFLECTANCE_OBSTACLE, obstacles
-        ),
-        reflectance_robot=uniform(realism.reflectance_robot, Stream.REFLECTANCE_ROBOT, robots),
-        action_latency=whole(realism.action_latency, Stream.ACTION_LATENCY, robots),
-        observation_latency=whole(realism.observation_latency, Stream.OBSERVATION_LATENCY, robots),
-    )
-    return found._replace(seed=source.seed if _is_random(found, realism) else None)
+    seed, sizes = xp.asarray(seed, xp.uint32), {"R": robots, "K": epuck.SENSORS, "M": obstacles}
+    found: dict[str, Array] = {}
+    for name, (function, axes) in _DRAWN.items():
+        setting = getattr(realism, name)
+        if setting is not None:
+            source = noise.normal if function is _normal else noise.uniform
+            shape = tuple(sizes.get(axis, 2) for axis in axes)
+            drawn = source(seed, 0, Stream[name.upper()], shape, xp)
+            found[name] = function(setting, drawn, xp)
+    mismatch = found.pop("wheel_mismatch", None)
+    if "wheel_radius" in found or mismatch is not None:
+        radius = found.get("wheel_radius", robot.wheel_radius)
+        found["wheel_radius"] = _wheel_radius(radius, mismatch, xp)
+    is_random = bool(found) or any(getattr(realism, name) is not None for name in _PER_STEP)
+    return Factors(seed=seed if is_random else None, **found)
 
 
-def _wheel_radius(
-    source: _Source, realism: RealismConfig, robot: RobotConfig, robots: int
-) -> Array | None:
-    """Draws the radii [..., R, 2] of left and right wheels, m.
+def _wheel_radius(radius: Any, mismatch: Array | None, xp: Any) -> Array:
+    """Returns the radii [..., R, 2] of left and right wheels, m.
 
     The mismatch is (right - left) / mean, and each wheel takes half of it. A robot commanded to
     drive straight then turns by mismatch / track radians per metre.
     """
-    if realism.wheel_radius is None and realism.wheel_mismatch is None:
-        return None
-    radius = source.uniform(realism.wheel_radius, Stream.WHEEL_RADIUS, robots)
-    mismatch = source.normal(realism.wheel_mismatch, Stream.WHEEL_MISMATCH, robots)
-    radius = robot.wheel_radius if radius is None else radius
-    half = 0.5 * mismatch if mismatch is not None else source.xp.zeros_like(radius)
-    return source.xp.stack([radius * (1.0 - half), radius * (1.0 + half)], axis=-1)
-
-
-def _is_random(found: Factors, realism: RealismConfig) -> bool:
-    """Returns whether anything is random, at the start or at a control step."""
-    later = (getattr(realism, name) for name in _PER_STEP)
-    return any(value is not None for value in (*found, *later))
+    half = 0.5 * mismatch if mismatch is not None else xp.zeros_like(radius)
+    return xp.stack([radius * (1.0 - half), radius * (1.0 + half)], axis=-1)
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:

@@ -12,6 +12,7 @@ shows the arena from above, with x to the right and y up.
 """
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -87,18 +88,20 @@ def read(rows: Sequence[str], cell: float) -> Map:
       ConfigError: the text is invalid; the message says why.
     """
     _check_text(rows)
-    areas = _areas(rows)
+    areas: dict[str, list[Cell]] = {START: [], TARGET: []}
+    for r, row in enumerate(rows):
+        for c, letter in enumerate(row):
+            areas.setdefault(letter, []).append((r, c))
     pairs = _pairs(areas)
     _check_reach(rows, areas[START], areas[TARGET], pairs)
-    longest = max(len(rows), len(rows[0]))
     middle = np.array([len(rows[0]) - 1, len(rows) - 1]) / 2
-    points = [_points(areas[kind], middle, cell) for kind in (START, TARGET)]
+    start, target = (_points(areas[kind], middle, cell) for kind in (START, TARGET))
     ends = [[_centre(each, middle, cell) for each in pair] for pair in pairs]
     return Map(
-        side=round(longest * cell, 6),
+        side=round(max(len(rows), len(rows[0])) * cell, 6),
         wall=_walls(rows, cell),
-        start=points[0],
-        target=points[1],
+        start=start,
+        target=target,
         pair=np.array(ends, np.float64).reshape(-1, 2, 2),
     )
 
@@ -113,15 +116,10 @@ def _check_text(rows: Sequence[str]) -> None:
                 "rows of the same length."
             )
         for column, letter in enumerate(row, 1):
-            if letter not in (WALL, FLOOR) and not (letter.isascii() and letter.isalpha()):
+            if not re.fullmatch(r"[#.a-zA-Z]", letter) or letter in "st":
                 raise ConfigError(
                     f"map has {show(letter)} in row {number}, column {column}: give # (wall), . "
-                    "(floor), S (start area), T (target area), or a letter for one robot."
-                )
-            if letter in "st":
-                raise ConfigError(
-                    f"map has {show(letter)} in row {number}, column {column}: give S or T for an "
-                    "area, or another letter for one robot."
+                    "(floor), S (start area), T (target area), or another letter for one robot."
                 )
     if max(len(rows), len(rows[0])) > MOST_CELLS:
         raise ConfigError(
@@ -130,19 +128,9 @@ def _check_text(rows: Sequence[str]) -> None:
         )
 
 
-def _areas(rows: Sequence[str]) -> dict[str, list[Cell]]:
-    """Lists the cells of each letter that is neither wall nor floor."""
-    found: dict[str, list[Cell]] = {START: [], TARGET: []}
-    for r, row in enumerate(rows):
-        for c, letter in enumerate(row):
-            if letter not in (WALL, FLOOR):
-                found.setdefault(letter, []).append((r, c))
-    return found
-
-
 def _pairs(areas: dict[str, list[Cell]]) -> list[tuple[Cell, Cell]]:
     """Pairs the start and the target of each letter, in alphabetical order."""
-    letters = sorted({letter.lower() for letter in areas} - {"s", "t"})
+    letters = sorted({letter.lower() for letter in areas} - {"s", "t", WALL, FLOOR})
     for letter in letters:
         for each in (letter, letter.upper()):
             count = len(areas.get(each, []))
@@ -166,32 +154,19 @@ def _check_reach(
             f"map has {len(starts)} cells of S and {len(targets)} of T: give both, or a letter for "
             "each robot."
         )
+    from scipy import ndimage  # slow to import, and few stages have a map
+
+    floor = np.array([[letter != WALL for letter in row] for row in rows])
+    region: Any = ndimage.label(floor)  # cells that share edges, and their count
     wanted = [(start, target) for start in starts[:1] for target in targets]
     wanted += [(start, targets[0]) for start in starts[1:]]
     for start, target in [*wanted, *pairs]:
-        if target not in _reached(rows, start):
+        if region[0][start] != region[0][target]:
             raise ConfigError(
                 f"map has a target in row {target[0] + 1}, column {target[1] + 1} that cannot be "
                 f"reached from the start in row {start[0] + 1}, column {start[1] + 1}: leave a "
                 "path of cells that share edges."
             )
-
-
-def _reached(rows: Sequence[str], start: Cell) -> set[Cell]:
-    """Flood-fills the floor from a cell, across the edges of cells."""
-    found, edge = {start}, [start]
-    while edge:
-        r, c = edge.pop()
-        for near in ((r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)):
-            if near not in found and _is_floor(rows, near):
-                found.add(near)
-                edge.append(near)
-    return found
-
-
-def _is_floor(rows: Sequence[str], cell: Cell) -> bool:
-    r, c = cell
-    return 0 <= r < len(rows) and 0 <= c < len(rows[0]) and rows[r][c] != WALL
 
 
 def _centre(cell: Cell, middle: np.ndarray, edge: float) -> np.ndarray:
@@ -218,17 +193,10 @@ def _walls(rows: Sequence[str], edge: float) -> np.ndarray:
         found += [(0, -margin, width, 0), (0, height, width, height + margin)]
     if height > width:
         found += [(-margin, 0, 0, height), (width, 0, width + margin, height)]
-    walls = [
-        (
-            ((left + right) / 2 - width / 2) * edge,
-            (height / 2 - (top + bottom) / 2) * edge,
-            0.0,
-            (right - left) / 2 * edge,
-            (bottom - top) / 2 * edge,
-        )
-        for left, top, right, bottom in found
-    ]
-    return np.array(walls, np.float64).reshape(-1, 5)
+    left, top, right, bottom = np.array(found, np.float64).reshape(-1, 4).T
+    x, y = (left + right) / 2 - width / 2, height / 2 - (top + bottom) / 2
+    half_x, half_y = (right - left) / 2, (bottom - top) / 2
+    return np.stack([x * edge, y * edge, 0 * x, half_x * edge, half_y * edge], axis=-1)
 
 
 def _rectangles(rows: Sequence[str]) -> Iterator[tuple[int, int, int, int]]:

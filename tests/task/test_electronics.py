@@ -217,7 +217,7 @@ def test_a_dead_sensor_sees_nothing(xp: ModuleType, kind: Kind, encoding: Encodi
     dead[1, 2, PS5] = True
     electronics, sight = _electronics(encoding, infrared=kind), _sight(xp, 0.012)
     sound = _first(electronics, Factors(), sight, xp)
-    seen = _first(electronics, _factors(xp, dead=dead), sight, xp).copy()
+    seen = _first(electronics, _factors(xp, dead_sensor=dead), sight, xp).copy()
     nothing = 0.04 if encoding == "metric" else FREE / 1023
     entry = (1, 2, INFRARED.start + PS5)
     np.testing.assert_allclose(seen[entry], nothing, rtol=1e-6)  # float32

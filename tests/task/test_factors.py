@@ -56,7 +56,6 @@ STEP: dict[str, Any] = {
 }
 FIELDS = {name: name for name in EPISODE} | {
     "wheel_mismatch": "wheel_radius",
-    "dead_sensor": "dead",
 }
 SHAPES = {
     "seed": (),
@@ -71,7 +70,7 @@ SHAPES = {
     "infrared_yaw": (ROBOTS, SENSORS),
     "infrared_position": (ROBOTS, SENSORS, 2),
     "infrared_period": (ROBOTS,),
-    "dead": (ROBOTS, SENSORS),
+    "dead_sensor": (ROBOTS, SENSORS),
     "reflectance_wall": (),
     "reflectance_obstacle": (OBSTACLES,),
     "reflectance_robot": (ROBOTS,),
@@ -152,7 +151,7 @@ def test_switching_a_factor_off_leaves_the_others_alone(name: str, drawn: Factor
 def test_shapes_and_types(drawn: Factors) -> None:
     one = _draw(ALL, np.uint32(3))
     grid = _draw(ALL, SEEDS[:6].reshape(2, 3))
-    kinds = {"seed": np.uint32, "dead": np.bool_}
+    kinds = {"seed": np.uint32, "dead_sensor": np.bool_}
     kinds |= {"action_latency": np.int32, "observation_latency": np.int32}
     for name, shape in SHAPES.items():
         assert np.shape(getattr(one, name)) == shape, name
@@ -239,10 +238,10 @@ def test_each_latency_is_as_likely(name: str, drawn: Factors) -> None:
 
 def test_sensors_are_dead_as_often_as_asked(drawn: Factors) -> None:
     count = len(SEEDS) * ROBOTS * SENSORS
-    share = np.asarray(drawn.dead).mean()
+    share = np.asarray(drawn.dead_sensor).mean()
     assert abs(share - 0.02) < FAR * math.sqrt(0.02 * 0.98 / count)
-    assert not np.asarray(_draw(_realism(dead_sensor=0.0)).dead).any()
-    assert np.asarray(_draw(_realism(dead_sensor=1.0)).dead).all()
+    assert not np.asarray(_draw(_realism(dead_sensor=0.0)).dead_sensor).any()
+    assert np.asarray(_draw(_realism(dead_sensor=1.0)).dead_sensor).all()
 
 
 def test_a_range_of_one_number_is_that_number() -> None:

@@ -89,7 +89,7 @@ def test_rectangles_cover_the_wall_once(cells: list[list[bool]]) -> None:
     [
         ("### #S", "map has 3 characters in row 1 and 2 in row 2: give rows of the same length."),
         ("#S?T#", "map has '?' in row 1, column 3: give # (wall), . (floor), S (start area), "),
-        ("#s.T#", "map has 's' in row 1, column 2: give S or T for an area, or another letter"),
+        ("#s.T#", "map has 's' in row 1, column 2: give # (wall), . (floor), S (start area), "),
         ("#S#T#", "map has a target in row 1, column 4 that cannot be reached from the start in "),
         ("#S..#", "map has 1 cells of S and 0 of T: give both, or a letter for each robot."),
         ("#a..#", "map has 'A' 0 times: give the start (a) and the target (A) of a robot once"),
