@@ -14,7 +14,7 @@ from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import fixed_level
 from swarmjax.task.layouts import drawing
-from swarmjax.task.layouts.drawing import Kind, LayoutArrays, RobotSizes
+from swarmjax.task.layouts.drawing import Kind, LayoutArrays
 from swarmjax.task.maps import MapArrays
 from swarmjax.task.placement import (
     UNITS,
@@ -29,6 +29,7 @@ from swarmjax.task.placement import (
     score_rectangles,
     score_things,
     score_walls,
+    split,
     units,
 )
 from swarmjax.task.stage import Stage
@@ -144,9 +145,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
     """Splits the uniform numbers by use."""
     many, few = spacing.obstacles, spacing.robots
-    ends = np.cumsum([2, 2, 2, many, many, few, few, few, 2])
-    starts = [0, *ends[:-1]]
-    return _Uniforms(*(uniforms[a:b] for a, b in zip(starts, ends, strict=True)))
+    return _Uniforms(*split(uniforms, [2, 2, 2, many, many, few, few, few, 2]))
 
 
 def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
@@ -294,8 +293,8 @@ def _laid_out(
 ) -> Level:
     """Lays out an arena. Robots and walls that the layout does not have are absent."""
     present = xp.arange(spacing.robots) < stage.robots
-    sizes = RobotSizes(spacing.hull_radius, spacing.target_radius)
-    arena = drawing.draw(kind, of, uniforms, present, sizes, xp)
+    hull, reach = spacing.hull_radius, spacing.target_radius
+    arena = drawing.draw(kind, of, uniforms, present, hull, reach, xp)
     walls, count = len(arena.obstacle), spacing.obstacles
     absent = xp.stack([xp.zeros_like(stage.obstacle_size)] * 3 + [0.5 * stage.obstacle_size] * 2)
     mine = np.arange(count)[:, None] < walls

@@ -6,7 +6,7 @@ that squared distances within the largest arena fit an int32.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +80,12 @@ def units(metres: Array, xp: Any) -> Array:
 def metres(units: Array, xp: Any) -> Array:
     """Converts units to metres (float32)."""
     return units.astype(xp.float32) / UNITS
+
+
+def split(uniforms: Array, counts: Sequence[int]) -> list[Array]:
+    """Splits uniform numbers into parts of the given lengths."""
+    ends = np.cumsum(counts)
+    return [uniforms[end - count : end] for end, count in zip(ends, counts, strict=True)]
 
 
 def lattice(shift: Array, side: Array, xp: Any) -> Array:

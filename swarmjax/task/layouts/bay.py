@@ -12,11 +12,10 @@ from swarmjax.task.layouts.site import (
     Drawn,
     Site,
     between,
-    in_units,
     pick,
     rows,
-    split,
 )
+from swarmjax.task.placement import round_up, split
 
 Array = Any
 _ENDS = 0.10  # m, length of the target area at either end of the corridor
@@ -46,9 +45,9 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     # The first robot goes right, the second left; there is no third.
     way = xp.where(np.arange(count) % 2 == 0, 1, -1)
     end = half_x - site.clear
-    last = in_units(_ENDS)
+    last = round_up(_ENDS)
     target_x = way * pick(targets, end - last, end, xp)
-    ahead = last + in_units(_AHEAD)
+    ahead = last + round_up(_AHEAD)
     start_x = -way * pick(starts, end - ahead - last, end - ahead, xp)
     most = xp.maximum(gap // 2 - site.hull - MARGIN_UNITS // 4, 0)
     off = middle + pick(aside, -most, most, xp)

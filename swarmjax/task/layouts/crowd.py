@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, points, split
-from swarmjax.task.placement import Gap, place, score_things
+from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, points
+from swarmjax.task.placement import Gap, place, score_things, split
 
 Array = Any
 _LATTICE = 40  # points along a side; they are 3 cm apart in an arena of 1.2 m

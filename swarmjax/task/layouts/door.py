@@ -11,14 +11,13 @@ from swarmjax.task.layouts.site import (
     Drawn,
     Site,
     between,
-    beyond,
-    in_units,
     pick,
+    place_starts,
+    place_targets,
     points,
     rows,
-    split,
 )
-from swarmjax.task.placement import place, score_things
+from swarmjax.task.placement import Gap, round_up, score_things, split
 
 Array = Any
 _ASIDE = 0.1  # largest offset of the wall from the middle, as a share of half the arena
@@ -41,23 +40,22 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     half_x, half_y = site.half[0], site.half[1]
     most = xp.floor(np.float32(_ASIDE) * half_x.astype(xp.float32)).astype(xp.int32)
     where, thin = pick(position[0], -most, most, xp), THICKNESS // 2
-    aside, jamb = site.numbers.gap // 2, in_units(_JAMB)
+    aside, jamb = site.numbers.gap // 2, round_up(_JAMB)
     most = xp.maximum(half_y - aside - jamb, 0)
     door = pick(position[1], -most, most, xp)
     halls = [_hall(site, where, side, shifts, xp) for side in (-1, 1)]
-    away = beyond(site.numbers.apart)
+    away = Gap(site.numbers.apart, site.numbers.apart)  # kept even where there is little room
     middle = xp.stack([where, door])[None]
     right = np.arange(count) % 2 == 0
     going = (site.present & right, site.present & ~right)
     target = 0
     for hall, there in zip(reversed(halls), going, strict=True):
         score = score_things(hall[0], middle, np.ones(1, bool), away, xp)
-        placed, _ = place(hall[0], score, targets, there, site.gaps.target, xp)
+        placed = place_targets(site, hall[0], score, targets, there, xp)
         target = xp.where(there[:, None], placed, target)
     start = 0
     for hall, there in zip(halls, going, strict=True):
-        score = score_things(hall[1], target, site.present, site.gaps.from_target, xp)
-        placed, _ = place(hall[1], score, starts, there, site.gaps.start, xp)
+        placed = place_starts(site, hall[1], target, starts, there, xp)
         start = xp.where(there[:, None], placed, start)
     upper, lower = between(door + aside, half_y), between(-half_y, door - aside)
     wall = rows(((where, upper[0], thin, upper[1]), (where, lower[0], thin, lower[1])), xp)

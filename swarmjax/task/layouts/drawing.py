@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax.task.layouts import LAYOUTS
-from swarmjax.task.layouts.site import NUMBERS, Drawn, Numbers, Site, between, pick, rows, split
-from swarmjax.task.placement import clearance, gaps_of, metres, round_up
+from swarmjax.task.layouts.site import NUMBERS, Drawn, Numbers, Site, between, pick, rows
+from swarmjax.task.placement import clearance, gaps_of, metres, round_up, split
 
 Array = Any
 _TURNS = 8  # quarter turns, and their mirror images
@@ -50,18 +50,6 @@ class LayoutArrays(NamedTuple):
     breadth: Array
     low: Array
     high: Array
-
-
-class RobotSizes(NamedTuple):
-    """Sizes of the robots that a level is drawn for.
-
-    Attributes:
-      hull_radius: m.
-      target_radius: distance at which a robot has arrived, m.
-    """
-
-    hull_radius: float
-    target_radius: float
 
 
 class Kind(NamedTuple):
@@ -107,16 +95,17 @@ def _stack(kind: Kind, entries: Sequence[Entry | None]) -> LayoutArrays:
 
 def uniform_count(kind: Kind, robots: int) -> int:
     """Returns how many uniform numbers an arena for `robots` robots takes."""
-    return before_own(robots) + LAYOUTS[kind.name].uniforms(robots, kind.cells)
-
-
-def before_own(robots: int) -> int:
-    """Returns how many uniform numbers precede the layout's own: lengths, the turn and headings."""
-    return LENGTHS + 1 + robots
+    return LENGTHS + 1 + robots + LAYOUTS[kind.name].uniforms(robots, kind.cells)
 
 
 def draw(
-    kind: Kind, of: LayoutArrays, uniforms: Array, present: Array, sizes: RobotSizes, xp: Any
+    kind: Kind,
+    of: LayoutArrays,
+    uniforms: Array,
+    present: Array,
+    hull: float,
+    reach: float,
+    xp: Any,
 ) -> LaidOut:
     """Lays an arena out.
 
@@ -125,7 +114,8 @@ def draw(
       of: numbers of the layout in one stage, in fields [...].
       uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
       present: [R] whether the robot is present.
-      sizes: sizes of robots and targets.
+      hull: radius of the robots, m.
+      reach: distance at which a robot has arrived, m.
       xp: `numpy` or `jax.numpy`; both draw the same arena.
 
     Returns:
@@ -141,10 +131,10 @@ def draw(
         numbers=Numbers(*(numbers[i] for i in range(len(NUMBERS)))),
         cells=kind.cells,
         present=present,
-        hull=round_up(sizes.hull_radius),
-        clear=clearance(sizes.hull_radius),
-        reach=round_up(sizes.target_radius),
-        gaps=gaps_of(sizes.hull_radius, sizes.target_radius),
+        hull=round_up(hull),
+        clear=clearance(hull),
+        reach=round_up(reach),
+        gaps=gaps_of(hull, reach),
     )
     drawn = layout.draw(rest, site, xp)
     drawn = _with_bars(drawn, half, xp) if kind.narrow else drawn

@@ -16,9 +16,8 @@ from swarmjax.task.layouts.site import (
     place_targets,
     points,
     rows,
-    split,
 )
-from swarmjax.task.placement import score_rectangles
+from swarmjax.task.placement import score_rectangles, split
 
 Array = Any
 _ASIDE = 0.1  # largest offset of the fence from the middle, as a share of half the arena

@@ -15,8 +15,8 @@ from swarmjax.task.layouts.site import (
     Drawn,
     Site,
     pick,
-    split,
 )
+from swarmjax.task.placement import split
 
 Array = Any
 _PASSAGE = 0.20  # m, least free width: one robot can pass another that parks in the middle

@@ -16,8 +16,8 @@ from swarmjax.task.layouts.site import (
     place_starts,
     points,
     rows,
-    split,
 )
+from swarmjax.task.placement import split
 
 Array = Any
 _BEFORE = 0.08  # m, from the first target to the mouth of the corridor

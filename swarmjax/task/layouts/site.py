@@ -1,16 +1,15 @@
 """Shared parts of layouts: arenas, walls, and areas for robots."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.task.placement import MARGIN, UNITS, Gap, Gaps, place, score_things
+from swarmjax.task.placement import MARGIN, Gaps, place, round_up, score_things
 
 Array = Any
 NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # settings of a stage, m
-THICKNESS = math.ceil(0.02 * UNITS)  # thickness of walls within an arena, units
+THICKNESS = round_up(0.02)  # thickness of walls within an arena, units
 LATTICE = 24  # points along each edge of an area
 
 
@@ -120,12 +119,6 @@ def pick(uniform: Array, low: Array, high: Array, xp: Any) -> Array:
     return low + xp.minimum(above, count - 1)
 
 
-def split(uniforms: Array, counts: Sequence[int]) -> list[Array]:
-    """Splits uniform numbers into parts of the given lengths."""
-    ends = np.cumsum(counts)
-    return [uniforms[end - count : end] for end, count in zip(ends, counts, strict=True)]
-
-
 def rows(table: Sequence[Sequence[Array]], xp: Any) -> Array:
     """Makes an array [W, 4] of rectangles: x, y and half edges, units."""
     return xp.stack([xp.stack([xp.asarray(x, xp.int32) for x in row]) for row in table])
@@ -177,14 +170,4 @@ def place_starts(
     return place(area, score, picks, there, site.gaps.start, xp)[0]
 
 
-def beyond(passage: int) -> Gap:
-    """Returns a least distance that is also kept where there is little room."""
-    return Gap(passage, passage)
-
-
-def in_units(metres: float) -> int:
-    """Rounds a length up to units."""
-    return math.ceil(metres * UNITS)
-
-
-MARGIN_UNITS = in_units(MARGIN)
+MARGIN_UNITS = round_up(MARGIN)

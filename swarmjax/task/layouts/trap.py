@@ -10,14 +10,13 @@ from swarmjax.task.layouts.site import (
     Demand,
     Drawn,
     Site,
-    in_units,
     pick,
     place_starts,
     place_targets,
     points,
     rows,
-    split,
 )
+from swarmjax.task.placement import round_up, split
 
 Array = Any
 _ROOM = 0.20  # m, before the mouth and behind the trap: one start or target, and spare space
@@ -40,7 +39,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     place, shifts, targets, starts = split(uniforms, [2, 4, count, count])
     width, depth = site.numbers.width, site.numbers.depth
     half_x, half_y = site.half[0], site.half[1]
-    room, way = in_units(_ROOM), in_units(_WAY)
+    room, way = round_up(_ROOM), round_up(_WAY)
     back = pick(place[0], room + depth - half_x, half_x - room - THICKNESS, xp)
     most = xp.maximum(half_y - way - THICKNESS - width // 2, 0)
     middle = pick(place[1], -most, most, xp)
