@@ -53,10 +53,6 @@ def main(arguments: Sequence[str]) -> int:
                 f"{each.path}: the rewards leave out {missing}: to see them, give extensions=FILE, "
                 "the file that the policy was trained with\n"
             )
-        if record.weights(each.policy, settings.task).path_progress:
-            sys.stdout.write(
-                f"{each.path}: the rewards leave out path_progress, which replays do not measure\n"
-            )
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:

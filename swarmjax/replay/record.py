@@ -1,7 +1,10 @@
-"""Records episodes step by step from the judge in MuJoCo's C engine. No JAX."""
+"""Records episodes step by step from the judge in MuJoCo's C engine.
+
+Only shortest paths and terms of an extension need JAX.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -152,8 +155,9 @@ def record(
     return [
         _cut(
             Frame(*(field[:, i] for field in every)),
+            level,
             _scene(level, _of_arena(mount, i)),
-            judge.config.task,
+            judge,
             earning,
             own,
         )
@@ -200,13 +204,14 @@ def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
 
 def _cut(
     frames: Frame,
+    level: Level,
     scene: ReplayScene,
-    task: TaskConfig,
+    judge: Judge,
     earning: RewardConfig,
     own: Sequence[tuple[RewardTerm, float]],
 ) -> Recording:
     """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
-    over = frames.arrived.all(axis=-1)
+    task, over = judge.config.task, frames.arrived.all(axis=-1)
     frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
     before = frames.arrived[:-1]
     active, present = arrival.drives(task.arrival, before), np.ones_like(before)
@@ -220,8 +225,10 @@ def _cut(
         touching=frames.touching[1:],
         outside=~before,
     )
-    measured = replace(earning, path_progress=0.0)  # a replay measures no paths
-    earned = reward.weighted(steps, measured) | _own(own, steps, frames)
+    if earning.path_progress:
+        path = _measure_paths(level, frames.pose, judge.config.robot.hull_radius)
+        steps = steps._replace(path_before=path[:-1], path=path[1:])
+    earned = reward.weighted(steps, earning) | _own(own, steps, frames)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
         scene=scene,
@@ -237,6 +244,22 @@ def _cut(
         arrived=frames.arrived,
         arrival=_since(frames.arrived),
     )
+
+
+def _measure_paths(level: Level, pose: np.ndarray, hull_radius: float) -> np.ndarray:
+    """Measures shortest paths [N, R] (m) from poses [N, R, 3] to the targets as training does."""
+    import jax  # only for rewards along paths
+
+    from swarmjax.task import geodesic
+
+    level, place = jax.tree.map(jax.numpy.asarray, (level, pose[1:, :, :2].astype(np.float32)))
+
+    def follow(path: geodesic.Path, now: jax.Array) -> tuple[geodesic.Path, jax.Array]:
+        path = geodesic.go_on(path, now, level, hull_radius)
+        return path, path.distance
+
+    first = geodesic.begin(level, hull_radius)
+    return np.concatenate([first.distance[None], jax.lax.scan(follow, first, place)[1]])
 
 
 def _since(arrived: np.ndarray) -> np.ndarray:

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import extensions
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import replays
@@ -15,11 +17,13 @@ from swarmjax.policy import PolicyError
 from swarmjax.replay import record as replay_record
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.sim import infrared
+from swarmjax.task import geodesic
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.stage_files import load_levels
 
 WEIGHTS = RewardConfig(
     progress=2.0,
+    path_progress=1.5,
     proximity=-0.01,
     arrival=0.5,
     contact=-0.3,
@@ -92,6 +96,22 @@ def test_rewards_are_those_of_the_steps(steer):
     np.testing.assert_allclose(total["proximity"], -0.001 * np.array(lit), atol=1e-12)
     assert sum(lit) > 0
     assert (recording.arrival > 0).any()
+
+
+def test_progress_along_paths_is_that_of_training(steer):
+    judge, (recording,) = replays.recorded(
+        steer, *replays.SMALL, "level=2", "steps=100", "task.reward.path_progress=2"
+    )
+    level = cells.split(cells.load(judge.config).cells[0].levels)[2]
+    level = jax.tree.map(jnp.asarray, level)
+    path = geodesic.begin(level, judge.config.robot.hull_radius)
+    end = geodesic.go_on(path, recording.pose[-1, :, :2], level, judge.config.robot.hull_radius)
+    np.testing.assert_allclose(
+        recording.reward["path_progress"].sum(axis=0)[recording.arrival == 0],
+        2.0 * (path.distance - end.distance)[recording.arrival == 0],
+        atol=1e-5,  # sums of 100 float32
+    )
+    assert (recording.arrival == 0).any()
 
 
 def _with_terms(tmp_path: Path, body: str) -> tuple[Path, str]:

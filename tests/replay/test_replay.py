@@ -281,15 +281,6 @@ def test_a_policy_that_does_not_fit_is_refused(steer, tmp_path):
         replay.main(words)
 
 
-def test_it_says_that_rewards_leave_out_progress_along_paths(capsys, steer, tmp_path):
-    words = [f"policy={steer}", *QUICK, f"out={tmp_path / 'a.html'}"]
-    assert replay.main([*words, "task.reward.path_progress=1"]) == 0
-    sentence = f"{steer}: the rewards leave out path_progress, which replays do not measure\n"
-    assert sentence in capsys.readouterr().out
-    assert replay.main(words) == 0
-    assert "path_progress" not in capsys.readouterr().out
-
-
 def test_a_mistake_ends_in_one_sentence_and_code_2(capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["replay", "policy=none.npz"])
     assert command.run("replay", replay.main, ReplayConfig) == 2
