@@ -137,14 +137,8 @@ def no_verdict(stages: int) -> CohortVerdict:
 
 def restart(cohorts: Cohorts) -> Cohorts:
     """Begins a cohort when all arenas are drawn again: their open episodes will never end."""
-    empty = _no_episodes(cohorts.record.success.shape[0])
-    return replace(
-        cohorts,
-        number=cohorts.number + 1,
-        age=jnp.zeros_like(cohorts.age),
-        previous=empty,
-        current=empty,
-    )
+    blank = init(cohorts.record.success.shape[0])
+    return replace(blank, number=cohorts.number + 1, record=cohorts.record)
 
 
 def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:

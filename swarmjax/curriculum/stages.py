@@ -136,13 +136,19 @@ def promoting(
     Returns:
       The choice from the next update on.
     """
-    stage, reason = _promote(state, schedule, verdict, update)
+    now, deadline = state.chosen.stage, jnp.asarray(schedule.deadline)
+    last = now == deadline.shape[0] - 1
+    whole = verdict.judged[now] & (state.turn - 1 >= state.since)
+    settled = verdict.over | (state.turn > state.since)
+    passed = whole & (verdict.success[now] >= schedule.threshold) & ~last
+    expired = settled & (update + 1 >= deadline)[now] & ~last
+    reason = jnp.where(passed, BY_THRESHOLD, jnp.where(expired, BY_BUDGET, STAYED))
+    stage = now + (passed | expired)
     index = jnp.arange(state.chosen.weights.shape[0])
     share = jnp.where(stage > 0, _EARLIER if options.mode == "mixed" else 0.0, 0.0)
     earlier = jnp.where(index < stage, share / jnp.maximum(stage, 1), 0.0)
-    return StageChoice(
-        stage=stage, weights=jnp.where(index == stage, 1.0 - share, earlier), reason=reason
-    )
+    weights = jnp.where(index == stage, 1.0 - share, earlier)
+    return StageChoice(stage=stage, weights=weights, reason=reason.astype(jnp.int32))
 
 
 def adaptive(
@@ -179,35 +185,15 @@ def adaptive(
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
     if options.shares == "robots":
-        weights = _per_robot(weights, jnp.asarray(schedule.stages.robots))
+        # The shares of arenas that give these shares of robots.
+        arenas = weights / jnp.asarray(schedule.stages.robots).astype(jnp.float32)
+        weights = arenas / jnp.sum(arenas)
     judged = verdict.over & jnp.any(verdict.judged)
     return StageChoice(
         stage=jnp.full_like(state.chosen.stage, stages - 1),
         weights=jnp.where(verdict.over, weights, state.chosen.weights),
         reason=jnp.where(judged, REWEIGHED, STAYED).astype(jnp.int32),
     )
-
-
-def _promote(
-    state: StagesState, schedule: Schedule, verdict: CohortVerdict, update: Array
-) -> tuple[Array, Array]:
-    """Returns the next or the same stage, and the reason."""
-    stage, deadline = state.chosen.stage, jnp.asarray(schedule.deadline)
-    last = stage == deadline.shape[0] - 1
-    whole = verdict.judged[stage] & (state.turn - 1 >= state.since)
-    success = verdict.success[stage]
-    settled = verdict.over | (state.turn > state.since)
-    late = update + 1 >= deadline
-    passed = whole & (success >= schedule.threshold) & ~last
-    expired = settled & late[stage] & ~last
-    reason = jnp.where(passed, BY_THRESHOLD, jnp.where(expired, BY_BUDGET, STAYED))
-    return stage + (passed | expired), reason.astype(jnp.int32)
-
-
-def _per_robot(weights: Array, robots: Array) -> Array:
-    """Turns shares of robots [S] into the shares of arenas that give them."""
-    arenas = weights / robots.astype(jnp.float32)
-    return arenas / jnp.sum(arenas)
 
 
 def _learnability(record: Record) -> Array:

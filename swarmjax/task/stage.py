@@ -56,11 +56,9 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
       drawings: level drawings of an extension.
 
     Raises:
-      ConfigError: a fixed level has no room for its robots, or a level drawing is missing.
+      ConfigError: a level drawing is missing.
     """
     names = [piece.name for piece in drawings]
-    for stage in stages:
-        _check_fixed(stage)
     return Stage(
         robots=np.array([s.robots for s in stages], np.int32),
         obstacles=np.array([s.obstacles for s in stages], np.int32),
@@ -101,18 +99,6 @@ def largest_half(stages: Sequence[StageConfig]) -> float:
     The model is compiled for this length.
     """
     return max(_half(stage) for stage in stages)
-
-
-def _check_fixed(stage: StageConfig) -> None:
-    """Refuses a fixed level with more robots or obstacles than it has room for."""
-    side = stage.sides[0]  # a fixed level has a single side
-    most = {"robots": fixed_level.most_robots(side), "obstacles": len(fixed_level.BOXES)}
-    for key, limit in most.items():
-        if stage.level == "fixed" and getattr(stage, key) > limit:
-            raise ConfigError(
-                f"stage {stage.name}: {key} is {getattr(stage, key)}, but the fixed level of a "
-                f"{side:g} m arena has room for {limit}: give at most {limit}."
-            )
 
 
 def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from swarmjax.config import ConfigError, Section, about, section, show
 from swarmjax.sim.config import SimConfig
-from swarmjax.task import maps
+from swarmjax.task import fixed_level, maps
 from swarmjax.task.layouts import LAYOUTS
 from swarmjax.task.layouts.drawing import Kind
 from swarmjax.task.layouts.site import NUMBERS, ArenaLayout, Demand
@@ -155,8 +155,20 @@ class StageConfig(Section):
             raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
         if self.layout == "fence" and self.obstacles < 1:
             raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
-        if self.level == "fixed" and isinstance(self.side, tuple):
+        if self.level != "fixed":
+            return
+        if isinstance(self.side, tuple):
             raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
+        most = {
+            "robots": fixed_level.most_robots(self.side),
+            "obstacles": len(fixed_level.BOXES),
+        }
+        for key, limit in most.items():
+            if getattr(self, key) > limit:
+                raise ConfigError(
+                    f"{key} is {getattr(self, key)}, but the fixed level of a {self.side:g} m "
+                    f"arena has room for {limit}: give at most {limit}."
+                )
 
     def _check_map(self) -> None:
         drawn = self.drawn_map
