@@ -55,7 +55,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     },
     "swarmjax.watch": {
         "run=runs/first": "serve a page on this machine, and print its address",
-        "run=runs/first port=8000 seconds=10": "on a port of your choice, with more replays",
+        "run=runs/first port=8000": "on a port of your choice",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
