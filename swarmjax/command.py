@@ -50,7 +50,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
-        "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
+        "runs=runs/first,runs/array": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.watch": {
         "run=runs/first": "serve a page on this machine, and print its address",

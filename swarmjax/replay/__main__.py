@@ -42,21 +42,14 @@ def main(arguments: Sequence[str]) -> int:
         page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
         outputs.write({out: page.encode()})
         if video:
-            bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
+            pictures = [replay_video.rows(settings, each.runs) for each in episodes]
+            bar = progress.add_task("pictures", total=sum(map(len, pictures)))
             report = partial(progress.advance, bar)
             replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
-        missing = _left_out(settings, each)
-        if missing:
-            sys.stdout.write(
-                f"{each.path}: the rewards leave out {missing}: to see them, give extensions=FILE, "
-                "the file that the policy was trained with\n"
-            )
-        if record.weights(each.policy, settings.task).path_progress:
-            sys.stdout.write(
-                f"{each.path}: the rewards leave out path_progress, which replays do not measure\n"
-            )
+        if missing := _left_out(settings, each):
+            sys.stdout.write(f"{each.path}: the rewards leave out {missing}\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:
@@ -65,11 +58,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
-    """Names the reward terms of training whose code is missing here."""
+    """Names the reward terms of training that are not shown: paths, and terms without code."""
     earning = record.weights(entrant.policy, settings.task)
     own = record.own_terms(entrant.policy, settings.extensions, earning)
     known = {piece.name for piece, _ in own}
-    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in known)
+    missing = [name for name, weight in earning.extra.items() if weight and name not in known]
+    return ", ".join(["path_progress"] * bool(earning.path_progress) + missing)
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:

@@ -55,9 +55,9 @@ def test_a_recording_is_what_the_judge_saw(steer):
     words = [*replays.SMALL, "level=0,3", "steps=200", "realism=real"]
     judge, found = replays.recorded(steer, *words)
     settings = load_levels(ReplayConfig, [f"policy={steer}", *words])
-    levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
-    for number, recording in zip(settings.levels, found, strict=True):
-        alone = engine_c.simulate(judge, [levels[number]])
+    levels = cells.split(cells.draw_stage(settings.evaluation, settings.levels).levels)
+    for level, recording in zip(levels, found, strict=True):
+        alone = engine_c.simulate(judge, [level])
         assert len(recording.pose) == alone.clock[0] + 1
         np.testing.assert_array_equal(recording.arrival, alone.arrival[0])
         np.testing.assert_array_equal(recording.contacts[-1], alone.contacts[0])
@@ -65,7 +65,6 @@ def test_a_recording_is_what_the_judge_saw(steer):
             (recording.ray[1:] < 0.04).any(axis=-1)[:, alone.arrival[0] == 0].sum(axis=0),
             alone.sensed[0][alone.arrival[0] == 0],
         )
-        level = levels[number]
         np.testing.assert_allclose(recording.pose[0], level.start, atol=1e-6)  # of float32
         away = np.linalg.norm(recording.pose[..., :2] - level.target, axis=-1)
         np.testing.assert_allclose(recording.distance, away, atol=1e-9)  # of float64
