@@ -67,12 +67,9 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:
-    """Checks that a file can be written, and overwrites no file that the command reads."""
+    """Checks that a file can be written."""
     if path.suffix != ending:
         raise ConfigError(f"{key} is {path}: give a name that ends with {ending}.")
-    read = [Path(each) for each in (*settings.policies, settings.suite) if each is not None]
-    if path.resolve() in [each.resolve() for each in read]:
-        raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
     outputs.check(key, [path], overwrite=settings.overwrite)
     outputs.make_room(key, path)
 

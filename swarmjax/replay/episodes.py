@@ -1,6 +1,6 @@
 """Chooses the episodes of a replay, and records them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -63,10 +63,7 @@ def replay(
         picks = worst(
             list(evaluate_trials.run(judged, chosen, entrants[:1], report)), settings.worst
         )
-    used = [chosen[row] for row in {pick.cell for pick in picks}]
-    limits = [evaluate_trials.specialise(judged, cell).step_limit for cell in used]
-    bar = progress.add_task("steps", total=sum(limits) * len(entrants))
-    return _record(settings, entrants, chosen, picks, partial(progress.advance, bar))
+    return _record(settings, entrants, chosen, picks)
 
 
 def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
@@ -93,7 +90,6 @@ def _record(
     entrants: Sequence[Entrant],
     chosen: Sequence[Cell],
     picks: Sequence[Pick],
-    report: Callable[[int], None],
 ) -> list[ReplayEpisode]:
     """Records episodes; those of one cell run side by side."""
     recorded = {}
@@ -104,7 +100,7 @@ def _record(
         for each in entrants:
             judged = evaluate_trials.specialise(settings.evaluation, cell, each.path)
             judge = evaluate_judge.load(judged, each.policy, cell.half)
-            runs.append(record.record(judge, [levels[pick.row] for pick in mine], report))
+            runs.append(record.record(judge, [levels[pick.row] for pick in mine]))
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
             number = int(cell.episodes[pick.row])
             label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"

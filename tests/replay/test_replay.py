@@ -153,9 +153,9 @@ def test_a_file_that_is_read_is_not_written_over(steer, suite, tmp_path):
         path.write_bytes(steer.read_bytes())
     same = f"{tmp_path}/../{tmp_path.name}/a"
     for words, sentence in {
-        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which is given as another",
+        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which swarmjax did not write",
         (f"policy={steer},{film}", f"out={tmp_path / 'b.html'}", f"video={film}"): (
-            f"video is {film}, which is given as another file: give a new name."
+            f"video is {film}, which swarmjax did not write"
         ),
         (f"policy={steer}", f"out={steer}"): f"out is {steer}: give a name that ends with .html.",
         (
