@@ -116,7 +116,7 @@ _SOUND: dict[str, list[str]] = {
         "policy=policy.npz suite=suite.yaml",
         "compare=policy.npz,b.npz",
     ],
-    "replay": ["policy=policy.npz", "policy=policy.npz suite=suite.yaml cell=one", "policy=b.npz"],
+    "replay": ["policy=policy.npz", "policy=policy.npz suite=suite.yaml worst=1", "policy=b.npz"],
     "export": ["policy=policy.npz out=b.npz", "policy=policy.npz format=c", "run=run"],
     "report": ["run=run", "runs=run", "run=run out=there"],
     "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],

@@ -207,7 +207,7 @@ def main(arguments: Sequence[str]) -> int:
     _say(f"{words.count(len(cells), 'cell')}, {len(cells) - len(left)} of them done before")
     codes = dict.fromkeys((cell.label for cell in cells), 0) | work(left, settings)
     lines = table.read_each({cell.run: cell.label for cell in cells})
-    found = {"words": list(arguments), "codes": codes, "cells": table.plain(lines)}
+    found = {"words": list(arguments), "codes": codes, "cells": [line._asdict() for line in lines]}
     directory.write_json(folder / "sweep.json", found)
     outputs.note([folder / "sweep.json"])
     if lines:

@@ -50,12 +50,11 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
-        "run=runs/first send=true": "also send it to the run's TensorBoard or W&B",
-        "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
+        "runs=runs/first,runs/array": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.watch": {
         "run=runs/first": "serve a page on this machine, and print its address",
-        "run=runs/first port=8000 seconds=10": "on a port of your choice, with more replays",
+        "run=runs/first port=8000": "on a port of your choice",
     },
     "swarmjax.replay": {
         "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",

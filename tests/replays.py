@@ -17,7 +17,7 @@ SMALL = ("stage.robots=3", "stage.side=0.9", "stage.obstacles=2")
 
 def judge(settings: ReplayConfig) -> Judge:
     """Returns the judge of a replay's first policy on its stage."""
-    cell = cells.load(settings.evaluation).cells[0]
+    cell = cells.draw_stage(settings.evaluation, [0])
     (entrant,) = trials.read_policies(settings.policies[:1])
     return evaluate_judge.load(settings.evaluation, entrant.policy, cell.half)
 
@@ -26,8 +26,8 @@ def recorded(path: Path, *words: str) -> tuple[Judge, list[Recording]]:
     """Records the levels of a replay with the first policy."""
     settings = load_levels(ReplayConfig, [f"policy={path}", *words])
     found = judge(settings)
-    levels = cells.split(cells.load(settings.evaluation).cells[0].levels)
-    return found, replay_record.record(found, [levels[number] for number in settings.levels])
+    levels = cells.split(cells.draw_stage(settings.evaluation, settings.levels).levels)
+    return found, replay_record.record(found, levels)
 
 
 def wandering(robots: int, frames: int, seed: int = 0) -> Recording:

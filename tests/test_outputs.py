@@ -39,7 +39,6 @@ COMMANDS: dict[str, tuple[Main, list[str], str, str]] = {
         "page.html",
     ),
     "report": (report.main, ["run=run", "out=told"], "out", "told/report.html"),
-    "table": (report.main, ["runs=run", "out=told"], "out", "told/report.json"),
     "suite": (suite.main, ["suite=mine.yaml", "out=levels.npz"], "out", "levels.npz"),
     "export npz": (export.main, ["policy=policy.npz", "out=b.npz"], "out", "b.npz"),
     "export onnx": (export.main, ["policy=policy.npz", "format=onnx"], "out", "policy.onnx"),
@@ -74,7 +73,7 @@ def test_a_file_of_the_user_is_refused_before_the_work(
     assert Path(lost).read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["evaluate folder", "replay", "table", "suite", "export npz"])
+@pytest.mark.parametrize("name", ["evaluate folder", "replay", "report", "suite", "export npz"])
 @pytest.mark.usefixtures("folder")
 def test_a_command_replaces_its_own_output_and_on_request_any_file(name: str) -> None:
     main, words, _, written = COMMANDS[name]

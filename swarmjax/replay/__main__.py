@@ -42,17 +42,14 @@ def main(arguments: Sequence[str]) -> int:
         page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
         outputs.write({out: page.encode()})
         if video:
-            bar = progress.add_task("pictures", total=replay_video.count(settings, episodes))
+            pictures = [replay_video.rows(settings, each.runs) for each in episodes]
+            bar = progress.add_task("pictures", total=sum(map(len, pictures)))
             report = partial(progress.advance, bar)
             replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
-        missing = _left_out(settings, each)
-        if missing:
-            sys.stdout.write(
-                f"{each.path}: the rewards leave out {missing}: to see them, give extensions=FILE, "
-                "the file that the policy was trained with\n"
-            )
+        if missing := _left_out(settings, each):
+            sys.stdout.write(f"{each.path}: the rewards leave out {missing}\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:
@@ -61,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
-    """Names the reward terms of training whose code is missing here."""
+    """Names the reward terms of training that are not shown, since their code is missing."""
     earning = record.weights(entrant.policy, settings.task)
     own = record.own_terms(entrant.policy, settings.extensions, earning)
     known = {piece.name for piece, _ in own}
@@ -69,12 +66,9 @@ def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:
-    """Checks that a file can be written, and overwrites no file that the command reads."""
+    """Checks that a file can be written."""
     if path.suffix != ending:
         raise ConfigError(f"{key} is {path}: give a name that ends with {ending}.")
-    read = [Path(each) for each in (*settings.policies, settings.suite) if each is not None]
-    if path.resolve() in [each.resolve() for each in read]:
-        raise ConfigError(f"{key} is {path}, which is given as another file: give a new name.")
     outputs.check(key, [path], overwrite=settings.overwrite)
     outputs.make_room(key, path)
 

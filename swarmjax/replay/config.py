@@ -15,9 +15,6 @@ class ReplayConfig(JudgeConfig):
     command: ClassVar[str] = "replay"
 
     policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
-    cell: str | None = field(
-        default=None, metadata=about("cell of the suite; null: all cells, only with worst")
-    )
     level: str | None = field(
         default=None,
         metadata=about("numbers of the levels, as in 0,7,12; null: 0, unless worst is given"),
@@ -27,9 +24,6 @@ class ReplayConfig(JudgeConfig):
     )
     out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
     video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
-    video_speed: float = field(
-        default=1.0, metadata=about("seconds of the episode per second of video", 0.05, 100.0)
-    )
 
     def _check(self) -> None:
         super()._check()
@@ -41,27 +35,12 @@ class ReplayConfig(JudgeConfig):
             raise ConfigError(
                 f"level is {self.level}, but worst is {self.worst}: give one of the two."
             )
-        if self.cell is not None and self.suite is None:
-            raise ConfigError(f"cell is {show(self.cell)}, but suite is null: give suite=NAME.")
-        if self.suite is None and self.worst is not None and self.worst > self.episodes:
-            raise ConfigError(
-                f"worst is {self.worst}, but episodes is {self.episodes}: "
-                f"give 1 to {self.episodes}."
-            )
-        self._check_levels()
-
-    def _check_levels(self) -> None:
+        if self.suite is not None and self.worst is None:
+            raise ConfigError(f"suite is {show(self.suite)}: say which levels, as in worst=5.")
         if self.level is not None and not re.fullmatch(r"\d{1,10}(,\d{1,10})*", self.level):
             raise ConfigError(
                 f"level is {show(self.level)}: give whole numbers with commas between them, "
                 "as in 0,7,12."
-            )
-        if len(set(self.levels)) < len(self.levels) or len(self.levels) > 100:
-            raise ConfigError(f"level is {show(self.level)}: give each level once, 100 at most.")
-        if self.suite is None and max(self.levels) >= self.episodes:
-            raise ConfigError(
-                f"level is {self.level}, but episodes is {self.episodes}: "
-                f"give 0 to {self.episodes - 1}."
             )
 
     @property
@@ -76,8 +55,6 @@ class ReplayConfig(JudgeConfig):
 
     @property
     def evaluation(self) -> EvaluateConfig:
-        """The evaluation to which the episodes belong; it draws no more levels than needed."""
+        """The evaluation to which the episodes belong."""
         shared = {item.name: getattr(self, item.name) for item in fields(JudgeConfig)}
-        if self.worst is None and self.suite is None:
-            shared["episodes"] = max(self.levels) + 1
         return EvaluateConfig(policy=self.policy, **shared)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 from swarmjax import epuck, provenance
-from swarmjax.config import files
 from swarmjax.pages import builder
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
@@ -35,7 +34,7 @@ def page(
     task = settings.task
     header = {
         "policies": list(settings.policies),
-        "about": _about(settings),
+        "about": f"{_levels(settings)}, {settings.robot.body} robots, simulated by MuJoCo C",
         "facts": _facts(settings, policies, words),
         "step": task.control_step,
         "kinds": list(gaps.KINDS),
@@ -71,19 +70,7 @@ def fill(title: str, packed: bytes) -> str:
 
 def _levels(settings: ReplayConfig) -> str:
     """Names the stage or the suite of the levels."""
-    if settings.suite is None:
-        return settings.stage.name
-    return settings.suite if settings.cell is None else f"{settings.suite}, {settings.cell}"
-
-
-def _about(settings: ReplayConfig) -> str:
-    """Describes the replay in one line; cells of a suite may have their own realism."""
-    if settings.suite is None:
-        realism = files.preset_of("realism", settings.realism)
-        where = f"stage {_levels(settings)}, realism {realism}"
-    else:
-        where = f"suite {_levels(settings)}"
-    return f"{where}, {settings.robot.body} robots, simulated by MuJoCo C"
+    return settings.stage.name if settings.suite is None else settings.suite
 
 
 def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
@@ -91,12 +78,11 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
     names = zip(settings.policies, policies, strict=True)
     versions = provenance.versions()
     length, angle = 1e3 * pack.LENGTH, pack.ANGLE
-    earned = "; nothing after arrival" if settings.task.arrival == "latch" else ""
     return [
         *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
         ("levels", _choice(settings)),
-        ("time", f"control steps of {settings.task.control_step:g} s, {_most_steps(settings)}"),
-        ("reward", f"by the weights that the policy was trained with{earned}"),
+        ("time", f"control steps of {settings.task.control_step:g} s"),
+        ("reward", "by the weights that the policy was trained with"),
         (
             "precision",
             f"errors of at most {length / 2:g} mm for positions, {angle / 2:g} rad for headings, "
@@ -108,20 +94,12 @@ def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> li
     ]
 
 
-def _most_steps(settings: ReplayConfig) -> str:
-    """Writes how long an episode may be; cells of a suite may have their own step limit."""
-    limit = f"{settings.evaluation.step_limit} at most"
-    is_given = settings.suite is None or settings.steps is not None
-    return limit if is_given else f"{limit}, unless the cell has its own step limit"
-
-
 def _choice(settings: ReplayConfig) -> str:
     """Writes which levels are shown."""
     origin = f"of seed {settings.seed}" if settings.suite is None else f"of {_levels(settings)}"
     if settings.worst is None:
         return origin
-    count = f"the first {settings.episodes:,}" if settings.suite is None else "all"
     return (
-        f"the {settings.worst} worst levels of {settings.policies[0]} among {count} {origin}, "
-        "worst first: fewest targets reached, then most contacts, then longest"
+        f"the {settings.worst} worst levels of {settings.policies[0]} {origin}, worst first: "
+        "fewest targets reached, then most contacts, then longest"
     )

@@ -3,19 +3,18 @@
 Only shortest paths and terms of an extension need JAX.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from swarmjax import extension
-from swarmjax.config import show
 from swarmjax.config.section import build_stored
 from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.extension import RewardTerm
-from swarmjax.policy import Policy, PolicyError
+from swarmjax.policy import Policy
 from swarmjax.sim import infrared
 from swarmjax.task import arrival, electronics, reward
 from swarmjax.task.config import RewardConfig, TaskConfig
@@ -110,32 +109,25 @@ def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
 
     Raises:
       ConfigError: If the weights in the file are invalid.
-      PolicyError: If the file's task is invalid.
     """
     stored = trained.meta["config"].get("task", {})
-    if not isinstance(stored, dict):
-        raise PolicyError(f"meta.config.task is {show(stored)}: expected an object.")
     if "reward" not in stored:
         return task.reward
     return build_stored(RewardConfig, stored["reward"], "the policy's config.task.reward.")
 
 
-def record(
-    judge: Judge, levels: Sequence[Level], report: Callable[[int], None] = lambda _: None
-) -> list[Recording]:
+def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     """Runs episodes side by side and records everything that a replay shows.
 
     Args:
       judge: Everything that the arenas share.
       levels: The arenas' levels.
-      report: Called after each control step with the number of steps added.
 
     Returns:
       Each episode up to the step in which all robots had arrived or the time was up.
 
     Raises:
       ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
-      PolicyError: If the policy's task is invalid.
     """
     earning = weights(judge.policy, judge.config.task)
     own = own_terms(judge.policy, judge.config.extensions, earning)
@@ -150,13 +142,12 @@ def record(
         arenas = engine_c.step(judge, arenas, action)
         frames.append(_look(judge, arenas, np.clip(action[..., :2], -1.0, 1.0)))
         over |= frames[-1].arrived.all(axis=-1)
-        report(1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
     return [
         _cut(
             Frame(*(field[:, i] for field in every)),
             level,
-            _scene(level, _of_arena(mount, i)),
+            _scene(level, mount, i),
             judge,
             earning,
             own,
@@ -286,8 +277,10 @@ def _own(
     return {piece.name: weight * extended.earn(piece, whole) for piece, weight in own}
 
 
-def _scene(level: Level, mount: infrared.Mount | None) -> ReplayScene:
-    """Records the fixed parts of an arena and the mounting of its sensors."""
+def _scene(level: Level, mount: infrared.Mount | None, i: int) -> ReplayScene:
+    """Records the fixed parts of arena i and the mounting of its sensors."""
+    if mount is not None:
+        mount = infrared.Mount(*(None if part is None else part[i] for part in mount))
     at_origin = np.zeros((len(level.target), 3))
     origin, toward = infrared.rays(at_origin, np, mount)
     return ReplayScene(
@@ -296,10 +289,3 @@ def _scene(level: Level, mount: infrared.Mount | None) -> ReplayScene:
         box=level.obstacle[level.obstacle_present].astype(float),
         sensor=np.concatenate([origin, toward], axis=-1),
     )
-
-
-def _of_arena(mount: infrared.Mount | None, i: int) -> infrared.Mount | None:
-    """Takes one arena's sensors."""
-    if mount is None:
-        return None
-    return infrared.Mount(*(None if part is None else part[i] for part in mount))

@@ -1,8 +1,7 @@
 """Makes a video of a replay: MuJoCo's renderer draws the scene in 3-D and ffmpeg encodes it.
 
 The scene is built from the recording, only to be looked at. Robots, walls and obstacles have their
-true sizes. Targets are discs of their radius on the floor. Infrared rays that meet something are
-lines.
+true sizes. Targets are discs of their radius on the floor.
 """
 
 import math
@@ -31,10 +30,8 @@ ELEVATION = math.radians(58.0)  # of the camera
 FIELD_OF_VIEW = math.radians(40.0)  # vertical; as in scene.xml
 _MARGIN = 1.06  # around the arena
 _WALL = 0.015  # m; half of a wall's drawn thickness
-_RAY = 0.0022  # m; half the width of a ray
 _FLAT = 5e-4  # m; half height of a target
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
-_LIT = np.array([1.0, 0.45, 0.05, 1.0], np.float32)
 _TOUCHING = (0.9, 0.0, 0.1, 1.0)
 _HIDDEN = (0.0, 0.0, 0.0, 0.0)
 
@@ -96,24 +93,11 @@ def write(
         raise outputs.unwritable("video", path, error) from None
 
 
-def count(settings: ReplayConfig, episodes: Sequence[ReplayEpisode]) -> int:
-    """Counts the pictures of a video.
-
-    Args:
-      settings: The replay's settings.
-      episodes: The recordings of each level.
-
-    Returns:
-      The number of pictures, at `FRAME_RATE` per second.
-    """
-    return sum(len(rows(settings, each.runs)) for each in episodes)
-
-
 def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
     """Lists which row of a level's recordings each picture shows.
 
     Args:
-      settings: The replay's settings, with the control step (s) and the speed of the video.
+      settings: The replay's settings, with the control step (s).
       runs: Recordings of the level, one per policy, [N, ...] each; N may differ.
 
     Returns:
@@ -121,7 +105,7 @@ def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
       seconds.
     """
     last = max(len(run.pose) for run in runs) - 1
-    pace = settings.video_speed / (FRAME_RATE * settings.task.control_step)  # rows per picture
+    pace = 1.0 / (FRAME_RATE * settings.task.control_step)  # rows per picture
     moving = [math.floor(k * pace) for k in range(math.ceil(last / pace))]
     return moving + [last] * round(HOLD * FRAME_RATE)
 
@@ -146,8 +130,9 @@ class _Shot:
         self.model = build(settings, recording).compile()
         self.data = mujoco.MjData(self.model)
         self.renderer = mujoco.Renderer(self.model, HEIGHT, width)
-        self.camera = _camera(recording.scene.side, width / HEIGHT)
-        self.reach = settings.task.sensor_range
+        self.camera = mujoco.MjvCamera()
+        self.camera.azimuth, self.camera.elevation = 90.0, -math.degrees(ELEVATION)
+        self.camera.distance = camera_distance(recording.scene.side, width / HEIGHT)
         robots = range(recording.pose.shape[1])
         self.rings = [self.model.geom(f"robot{i}_ring").id for i in robots]
 
@@ -162,26 +147,7 @@ class _Shot:
         self.model.geom_rgba[self.rings] = np.where(touching[:, None], _TOUCHING, _HIDDEN)
         mujoco.mj_forward(self.model, self.data)
         self.renderer.update_scene(self.data, self.camera)
-        self._add_rays(row)
         return self.renderer.render()
-
-    def _add_rays(self, row: int) -> None:
-        """Adds the rays that meet something."""
-        pose, ray = self.recording.pose[row], self.recording.ray[row]
-        sensor, scene = self.recording.scene.sensor, self.renderer.scene
-        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
-        origin = pose[:, None, :2] + np.einsum("rij,rkj->rki", turn, sensor[..., :2])
-        end = origin + ray[..., None] * np.einsum("rij,rkj->rki", turn, sensor[..., 2:])
-        for i, k in np.argwhere(ray < self.reach):
-            if scene.ngeom == scene.maxgeom:
-                return
-            geom, capsule = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_CAPSULE
-            mujoco.mjv_initGeom(geom, capsule, np.zeros(3), np.zeros(3), np.zeros(9), _LIT)
-            ends = [np.append(point[i, k], epuck.SENSOR_HEIGHT) for point in (origin, end)]
-            mujoco.mjv_connector(geom, capsule, _RAY, *ends)
-            geom.emission = 0.8
-            scene.ngeom += 1
 
 
 def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
@@ -198,7 +164,8 @@ def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
     half = 0.5 * recording.scene.side
     spec.geom("floor").size = [half, half, 1.0]
     _add_fixtures(spec, recording)
-    colours = [_rgba(text) for text in pack.colours(recording.pose.shape[1])]
+    names = pack.colours(recording.pose.shape[1])  # #rrggbb
+    colours = [[*(part / 255.0 for part in bytes.fromhex(name[1:])), 1.0] for name in names]
     for (x, y), colour in zip(recording.scene.target, colours, strict=True):
         size = [settings.task.target_radius, _FLAT, 0.0]
         _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
@@ -222,17 +189,14 @@ def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
 
 
 def _add_robot(spec: mujoco.MjSpec, name: str, radius: float, colour: list[float]) -> None:
-    """Adds a robot: its hull, a lid with an arrow ahead, and a ring that shows contacts."""
+    """Adds a robot: its hull with an arrow ahead, and a ring that shows contacts."""
     body = spec.worldbody.add_body(name=name, mocap=True)
-    half = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM)
-    top = epuck.HULL_TOP
+    half, top = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM), epuck.HULL_TOP
     _add(body, _CYLINDER, [radius, half, 0], [0, 0, half + epuck.HULL_BOTTOM], colour)
-    _add(body, _CYLINDER, [0.8 * radius, 5e-4, 0], [0, 0, top], [0.15, 0.16, 0.18, 1.0])
-    white = [0.97, 0.97, 0.97, 1.0]
     for side in (1.0, -1.0):
         # Two bars form the head of the arrow.
-        place = [0.18 * radius, side * 0.24 * radius, top + 1e-3]
-        _add(body, _BOX, [0.4 * radius, 0.09 * radius, 5e-4], place, white, -side * 0.65)
+        place = [0.18 * radius, side * 0.24 * radius, top]
+        _add(body, _BOX, [0.4 * radius, 0.09 * radius, 1e-3], place, yaw=-side * 0.65)
     ring = _add(body, _CYLINDER, [1.2 * radius, 1e-3, 0], [0, 0, 2e-3], list(_HIDDEN))
     ring.name = f"{name}_ring"
 
@@ -250,20 +214,6 @@ def _add(
     return body.add_geom(
         type=kind, size=size, pos=place, quat=turn, rgba=colour, contype=0, conaffinity=0
     )
-
-
-def _rgba(colour: str) -> list[float]:
-    """Reads #rrggbb."""
-    return [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)] + [1.0]
-
-
-def _camera(side: float, aspect: float) -> mujoco.MjvCamera:
-    """Makes a camera that looks at the middle of an arena and sees all of it."""
-    camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation = 90.0, -math.degrees(ELEVATION)
-    camera.lookat = [0.0, 0.0, 0.0]
-    camera.distance = camera_distance(side, aspect)
-    return camera
 
 
 def camera_distance(side: float, aspect: float) -> float:

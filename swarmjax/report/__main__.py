@@ -3,11 +3,9 @@
 For one run it writes its figures, and `report.html`, which holds all of them. The run may still be
 going or may have been killed: the report leaves out a line that is not fully written. No JAX.
 
-For several runs it prints a table: see `table`. With `out` it also writes the table there, as
-`report.html` and `report.json`.
+For several runs it prints a table: see `table`.
 """
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,74 +15,46 @@ from swarmjax.config import files
 from swarmjax.pages import builder
 from swarmjax.report import page as report_page
 from swarmjax.report import rows, table
-from swarmjax.report import send as report_send
 from swarmjax.report.config import ReportConfig
-from swarmjax.report.table import TableLine
 
-PAGE, TABLE = "report.html", "report.json"
+PAGE = "report.html"
 
 
-def write(
-    run: Path, out: Path, made_by: str, *, send: bool = False, overwrite: bool = False
-) -> list[Path]:
+def write(run: Path, out: Path, made_by: str, *, overwrite: bool = False) -> list[Path]:
     """Writes the report of a run.
 
     Args:
       run: the run directory.
       out: directory of the report; it is created.
       made_by: the command that makes the report, for the page.
-      send: whether the run's loggers also get the figures and the pages in the run directory.
       overwrite: whether files of other origin are replaced.
 
     Returns:
-      The files.
+      The files; the page is the last one.
 
     Raises:
-      ConfigError: if the run cannot be read, `out` cannot be written, or `send` finds no logger.
+      ConfigError: if the run cannot be read, or `out` cannot be written.
     """
     history = rows.read(run)
-    loggers = report_send.of_run(run, history) if send else []
     # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.report import figures as report_figures
 
     figures = report_figures.png_files(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
-    written = builder.write(out, content, overwrite=overwrite)
-    report_send.send(history, [*written, *sorted(run.glob("*.html"))], loggers)
-    return written
-
-
-def _write_table(lines: Sequence[TableLine], made_by: str, settings: ReportConfig) -> Path:
-    """Writes the table of several runs; returns the path of its page."""
-    page = builder.render(
-        "report/runs.html",
-        styles=report_page.STYLES,
-        title="Runs",
-        command=made_by,
-        heads=table.HEADS,
-        rows=table.cells(lines),
-        note=table.note(lines),
-    )
-    text = json.dumps(table.plain(lines), indent=2) + "\n"
-    content = {TABLE: text.encode(), PAGE: page.encode()}
-    return builder.write(Path(settings.out or ""), content, overwrite=settings.overwrite)[-1]
+    return builder.write(out, content, overwrite=overwrite)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(ReportConfig, arguments)
-    made_by = command.line("report", *arguments)
     if settings.runs is not None:
-        lines = table.read(table.find(settings.runs))
-        sys.stdout.write(f"{table.text(lines)}\n")
-        if settings.out:
-            page = _write_table(lines, made_by, settings)
-            sys.stdout.write(f"{page}: the same table as a page.\n")
+        sys.stdout.write(f"{table.text(table.read(table.find(settings.runs)))}\n")
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"
-    written = write(run, out, made_by, send=settings.send, overwrite=settings.overwrite)
+    made_by = command.line("report", *arguments)
+    written = write(run, out, made_by, overwrite=settings.overwrite)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0

@@ -17,26 +17,21 @@ class ReportConfig(Section):
     runs: str | None = field(
         default=None,
         metadata=about(
-            "instead of run: run directories, folders of runs (an array, a sweep) and patterns, "
-            "separated by commas; makes a table with one line for all runs of the same settings"
+            "instead of run: run directories, folders of runs (an array, a sweep), "
+            "separated by commas; prints a table with one line for all runs of the same settings"
         ),
     )
     out: str | None = field(
         default=None,
-        metadata=about("directory; null: <run>/report, or with runs only the printed table"),
+        metadata=about("directory of the report of a run; null: <run>/report"),
     )
     overwrite: bool = field(default=False, metadata=OVERWRITE)
-    send: bool = field(
-        default=False,
-        metadata=about(
-            "send the figures, and links to the report and to replays in the run directory, to the "
-            "run's TensorBoard and W&B [run]"
-        ),
-    )
 
     def _check(self) -> None:
         if (self.run is None) == (self.runs is None):
             both = "is missing" if self.run is None else "and runs are given"
             raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... for a table.")
-        if self.send and self.run is None:
-            raise ConfigError("send is true, but runs are given: give run=DIR, or leave it out.")
+        if self.runs is not None and self.out is not None:
+            raise ConfigError(
+                f"out is {self.out}, but the table of runs is only printed: leave it out."
+            )

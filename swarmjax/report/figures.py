@@ -5,7 +5,6 @@ The colour map viridis rises evenly in lightness, so stages can also be told apa
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -84,18 +83,22 @@ def success(history: History) -> Figure:
     panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     at = _at(len(history.updates), _POINTS)
     steps = history.arena_steps[at]
-    lately = report_rows.trained_lately(history)[:, at]
     mean = report_rows.together(history.success)[at]
     for i, panel in enumerate(panels[:stages]):
-        for seed, there in zip(history.success[:, at, i], lately[..., i], strict=True):
-            _curve(panel, steps, seed, there, color=_SEED, lw=0.7)
-        _curve(panel, steps, mean[:, i], lately[..., i].any(axis=0), color=_ALL, lw=2.0)
+        panel.plot(steps, history.success[:, at, i].T, color=_SEED, lw=0.7)
+        panel.plot(steps, mean[:, i], color=_ALL, lw=2.0)
         _mark(panel, history, i)
         panel.tick_params(labelbottom=i + columns >= stages)
     for panel in panels[stages:]:
         panel.set_visible(False)
-    _label_outer(figure, history)
-    _explain_lines(figure, history)
+    _label_steps(figure, history, 2 if stages > report_rows.MANY else 4)
+    panels[0].set_ylim(0, 1.02)
+    panels[0].yaxis.set_major_formatter(drawing.percent())
+    figure.supylabel(report_rows.measure(history), fontsize=10)
+    kinds = _seed_lines(history)
+    if stages > 1:
+        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
+    drawing.explain(figure, kinds, 3)
     return figure
 
 
@@ -110,17 +113,13 @@ def curves(history: History) -> Figure | None:
     panels = list(figure.subplots(2, 3, sharex=True).flat)
     for panel, (key, title) in zip(panels, _CURVES.items(), strict=False):
         steps, seeds = _stretched(history.arena_steps, history.curves[key])
-        for seed in seeds:
-            panel.plot(steps, seed, color=_SEED, lw=0.7)
+        panel.plot(steps, seeds.T, color=_SEED, lw=0.7)
         panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
         drawing.dress(panel, title)
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
     panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
-    panels[0].set_xlim(0, history.arena_steps[-1])
-    panels[0].xaxis.set_major_locator(MaxNLocator(4))
-    panels[0].xaxis.set_major_formatter(drawing.thousands())
-    figure.supxlabel(_STEPS, fontsize=10)
+    _label_steps(figure, history, 4)
     drawing.explain(figure, _seed_lines(history), 2)
     return figure
 
@@ -142,7 +141,7 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return steps[ends - 1], np.where(there, sums / np.maximum(there, 1), np.nan)
 
 
-def _name_colours(figure: Figure, axes: Axes | list[Axes], names: list[str]) -> None:
+def _name_colours(figure: Figure, axes: Axes, names: list[str]) -> None:
     """Adds a colour strip that names the bands in their order."""
     count = len(names)
     norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
@@ -155,33 +154,14 @@ def _name_colours(figure: Figure, axes: Axes | list[Axes], names: list[str]) -> 
     bar.outline.set_visible(False)
 
 
-def _curve(
-    panel: Axes, steps: np.ndarray, share: np.ndarray, lately: np.ndarray, **style: Any
-) -> None:
-    """Draws a line where the stage was trained on, and dots where it no longer was."""
-    panel.plot(steps, np.where(lately, share, np.nan), **style)
-    panel.plot(steps, np.where(lately, np.nan, share), ":", **style)
-
-
 def _mark(panel: Axes, history: History, stage: int) -> None:
     """Writes a panel's name and last share, and draws the share that promotes."""
     last, measured = report_rows.among(history.success[:, -1])
     share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
     small = len(history.names) > report_rows.MANY
     drawing.dress(panel, f"{history.names[stage]}   {share}", 7 if small else 10)
-    promoting = _promoting(history)
-    if promoting is not None:
-        panel.axhline(promoting, color=_LIMIT, lw=0.8, ls="--")
-
-
-def _explain_lines(figure: Figure, history: History) -> None:
-    """Adds a legend of the kinds of lines above the panels."""
-    kinds = _seed_lines(history)
-    if not report_rows.trained_lately(history)[~np.isnan(history.success)].all():
-        kinds.append(Line2D([], [], color=_ALL, ls=":", label="no longer trained on"))
-    if _promoting(history) is not None:
-        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
-    drawing.explain(figure, kinds, 4)
+    if len(history.names) > 1:
+        panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
 
 
 def _seed_lines(history: History) -> list[Line2D]:
@@ -195,17 +175,10 @@ def _seed_lines(history: History) -> list[Line2D]:
     ]
 
 
-def _promoting(history: History) -> float | None:
-    """Returns the success that promotes; None with a single stage."""
-    return history.config.curriculum.threshold if len(history.names) > 1 else None
-
-
-def _label_outer(figure: Figure, history: History) -> None:
-    """Labels the axes shared by all panels."""
-    panel = figure.axes[0]
-    panel.set(xlim=(0, history.arena_steps[-1]), ylim=(0, 1.02))
-    panel.xaxis.set_major_locator(MaxNLocator(2 if len(history.names) > report_rows.MANY else 4))
-    panel.xaxis.set_major_formatter(drawing.thousands())
-    panel.yaxis.set_major_formatter(drawing.percent())
+def _label_steps(figure: Figure, history: History, ticks: int) -> None:
+    """Scales and labels the steps, an axis that all panels share."""
+    axis = figure.axes[0].xaxis
+    figure.axes[0].set_xlim(0, history.arena_steps[-1])
+    axis.set_major_locator(MaxNLocator(ticks))
+    axis.set_major_formatter(drawing.thousands())
     figure.supxlabel(_STEPS, fontsize=10)
-    figure.supylabel(report_rows.measure(history), fontsize=10)

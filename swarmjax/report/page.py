@@ -1,7 +1,6 @@
 """Builds the page of a report: one self-contained HTML file with its figures inside."""
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +11,6 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History, Row
 from swarmjax.run.load_settings import leaves
 
-GOOD = 0.9  # success at which a stage counts as learned
 STYLES = (builder.STYLE, "report/report.css")
 
 
@@ -69,8 +67,6 @@ def facts(history: History) -> list[tuple[str, str]]:
             f"{words.count(trained.arenas, 'arena')}{time}",
         ),
         ("last stage", _last_stage(history)),
-        ("all stages", _all_stages(history)),
-        ("decisions", _counted(history.decisions)),
         ("computed by", _origin(history.summary)),
     ]
 
@@ -78,50 +74,17 @@ def facts(history: History) -> list[tuple[str, str]]:
 def _last_stage(history: History) -> str:
     """Writes the success of the last stage: interquartile mean and range over seeds."""
     values = history.success[:, -1, -1]
-    mean, measured = report_rows.among(values[:, None])
-    name, of = history.names[-1], len(history.seeds)
-    if not measured[0]:
-        return f"{name}: {_unmeasured(history)}"
-    text = f"{name}: {report_rows.measure(history)} {_percent(mean[0])}"
-    if of == 1:
+    (mean,), (measured,) = report_rows.among(values[:, None])
+    if not measured:
+        return "not measured, since no whole cohort has ended on it"
+    text = f"{history.names[-1]}: {report_rows.measure(history)} {_percent(mean)}"
+    if len(history.seeds) == 1:
         return text
     low, high = np.nanmin(values), np.nanmax(values)
     return (
-        f"{text} (interquartile mean of {measured[0]} of {of} seeds, {_percent(low)} to "
-        f"{_percent(high)})"
+        f"{text} (interquartile mean of {measured} of {len(history.seeds)} seeds, {_percent(low)} "
+        f"to {_percent(high)})"
     )
-
-
-def _unmeasured(history: History) -> str:
-    """Explains why the last stage has no number."""
-    trained = int((history.mix[..., -1] > 0.0).sum(axis=1).max())
-    if not trained:
-        return "not measured, since no arena has been on it"
-    takes = words.count(report_rows.verdict_updates(history), "update")
-    return (
-        f"not measured, since no whole cohort has ended on it: that takes {takes}, and arenas were "
-        f"on it for {trained:,}"
-    )
-
-
-def _all_stages(history: History) -> str:
-    """Counts the stages that are learned, and names the worst one."""
-    mean, measured = report_rows.among(history.success[:, -1])
-    good = int((mean >= GOOD).sum())
-    text = f"{good} of {len(mean)} at {_percent(GOOD)} or more"
-    if not measured.any():
-        return text
-    worst = int(np.nanargmin(mean))
-    rest = int((measured == 0).sum())
-    return f"{text}; lowest {history.names[worst]} with {_percent(mean[worst])}" + (
-        f"; {rest} not measured" if rest else ""
-    )
-
-
-def _counted(decisions: Sequence[Row]) -> str:
-    """Counts decisions by reason."""
-    reasons = Counter(str(row.get("why")) for row in decisions)
-    return ", ".join(f"{count:,} by {why}" for why, count in reasons.items()) or "none"
 
 
 def _origin(summary: Row) -> str:
@@ -157,7 +120,7 @@ def _stages(history: History) -> list[tuple]:
             stage.name,
             stage.robots,
             stage.obstacles,
-            report_rows.side_text(stage.sides),
+            " to ".join(f"{side:g}" for side in sorted(set(stage.sides))),
             _percent(share[i]),
             *(_percent(last[f"{key}_by_stage"][0][i]) for key in ("success", "complete")),
             *(_number(last[f"{key}_by_stage"][0][i]) for key in ("contacts", "return")),

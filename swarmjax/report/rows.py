@@ -7,7 +7,6 @@ written when the run was killed, so it is skipped. Any other damage raises an er
 file, line and key.
 """
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,13 +25,11 @@ Row = dict[str, Any]
 
 # Each stage's newest verdict, in the order of the stages.
 BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
-_LISTS = ("mix", "weights", *BY_STAGE)
+_LISTS = ("mix", *BY_STAGE)
 # Numbers of a whole update; the first two cover the episodes that ended in it.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
 MANY = 9  # with more stages than this, each is drawn small
 _LARGEST = float(np.finfo(np.float32).max)
-# A verdict takes two cohorts: its episodes begin in the first and the last of them end in the next.
-_COHORTS_OF_A_VERDICT = 2
 
 
 class ValueKind(NamedTuple):
@@ -77,7 +74,6 @@ class History:
       updates: [T], increasing from 0.
       arena_steps: [T] arena control steps of one seed by the end of the update.
       mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
-      weights: [N, T, S] share of the arenas that the curriculum gave the stage, 0 to 1.
       by_stage: [N, T, S] for each name in `BY_STAGE`.
       curves: [N, T] for each name in `CURVES`.
       seconds: training time up to the last update; None if it was not recorded.
@@ -90,7 +86,6 @@ class History:
     updates: np.ndarray
     arena_steps: np.ndarray
     mix: np.ndarray
-    weights: np.ndarray
     by_stage: dict[str, np.ndarray]
     curves: dict[str, np.ndarray]
     seconds: float | None
@@ -133,7 +128,6 @@ def read(run: Path) -> History:
         updates=np.array(updates),
         arena_steps=np.array([row["arena_steps"] for row in rows[0]]),
         mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
-        weights=np.nan_to_num(columns["weights"]),
         by_stage={key: columns[key] for key in BY_STAGE},
         curves=dict(zip(CURVES, np.moveaxis(curves, 2, 0), strict=True)),
         seconds=rows[0][-1]["train_s"],
@@ -167,24 +161,6 @@ def measure(history: History) -> str:
     return "targets reached" if by_targets else "episodes in which all arrived"
 
 
-def trained_lately(history: History) -> np.ndarray:
-    """Tells where [N, T, S] a stage's newest verdict is about the current networks.
-
-    A verdict counts as current for two cohorts (see `curriculum`) after the stage last had a share
-    of the arenas, since a new verdict may still arrive in that time.
-    """
-    lag = verdict_updates(history)
-    updates = history.updates[None, :, None]
-    given = np.where(history.weights > 0.0, updates, -np.inf)
-    return updates - np.maximum.accumulate(given, axis=1) <= lag
-
-
-def verdict_updates(history: History) -> int:
-    """Returns the updates between a stage's first share of the arenas and its first verdict."""
-    task, algo = history.config.task, history.config.algo
-    return _COHORTS_OF_A_VERDICT * math.ceil(task.step_limit / algo.rollout_length)
-
-
 def together(values: np.ndarray) -> np.ndarray:
     """Takes the interquartile mean over seeds where all of them have a value.
 
@@ -209,12 +185,6 @@ def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     there = ~np.isnan(values)
     mean = [iqm(v[t]) if t.any() else np.nan for v, t in zip(values.T, there.T, strict=True)]
     return np.array(mean), there.sum(axis=0)
-
-
-def side_text(sides: tuple[float, float]) -> str:
-    """Writes the side of a stage as one number or a range, without unit."""
-    low, high = sides
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def check(row: Mapping[str, Any], keys: Iterable[str], kind: ValueKind, where: str) -> None:

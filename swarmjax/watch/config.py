@@ -8,16 +8,13 @@ from swarmjax.config import Section, about
 
 @dataclass(frozen=True, kw_only=True)
 class WatchConfig(Section):
-    """Which run to follow, on which port, and how to replay its newest policy."""
+    """Which run to follow, and on which port."""
 
     command: ClassVar[str] = "watch"
 
     run: str = field(metadata=about("run directory"))
     port: int = field(
         default=0, metadata=about("port of the page, on 127.0.0.1; 0: any free port", 0, 2**16 - 1)
-    )
-    seconds: float = field(
-        default=30.0, metadata=about("shortest time between two replays, s", 1.0, 1e6)
     )
     extensions: str | None = field(
         default=None,

@@ -7,7 +7,6 @@ policy that needs an extension is shown only if the user names the extension's f
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from rich.progress import Progress
@@ -27,26 +26,15 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.watch.config import WatchConfig
 
 
-class Newest(NamedTuple):
-    """A replay of a run's newest policy.
-
-    Attributes:
-      update: updates that the policy was trained for.
-      sentence: a description of the replay.
-      page: the HTML page.
-    """
-
-    update: int
-    sentence: str
-    page: str
-
-
-def record(settings: WatchConfig, history: History | None) -> Newest:
+def record(settings: WatchConfig, history: History | None) -> tuple[str, str]:
     """Replays a level with the newest policy.
 
     Args:
       settings: settings of the page.
       history: the run's logged results; None before the first update.
+
+    Returns:
+      A sentence that describes the replay, and its HTML page.
 
     Raises:
       ConfigError: if the policy cannot be replayed with these settings.
@@ -76,7 +64,7 @@ def record(settings: WatchConfig, history: History | None) -> Newest:
         f"Level 0 of stage {stage.name}, by the policy{several} after "
         f"{words.count(update, 'update')}."
     )
-    return Newest(update, sentence, page)
+    return sentence, page
 
 
 def _stage(trained: TrainConfig, history: History | None) -> StageConfig:

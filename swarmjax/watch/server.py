@@ -104,60 +104,40 @@ class Answers(BaseHTTPRequestHandler):
     server_version, sys_version = "swarmjax", ""
     timeout = _TIMEOUT_S
 
-    def do_GET(self) -> None:  # the name that the library calls
+    def do_GET(self) -> None:  # the name that the library calls; it refuses other methods
         """Answers with the content at a path."""
-        if self._is_foreign():
+        if self.headers.get_all("Host") not in [[host] for host in self.server.hosts]:
+            text = f"Open {self.server.url}\n".encode()
+            self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", text)
             return
         answer = self._find(self.path.partition("?")[0])
         if answer is None:
             self._send(HTTPStatus.NOT_FOUND, "text/plain", b"There is no such page.\n")
             return
-        kind, content, frames = answer
-        self._send(HTTPStatus.OK, kind, content, {"Content-Security-Policy": frames})
+        self._send(HTTPStatus.OK, *answer)
 
-    def _find(self, path: str) -> tuple[str, bytes, str] | None:
-        """Returns type, content and framing policy for a path; None if there is no such page."""
+    def _find(self, path: str) -> tuple[Any, ...] | None:
+        """Returns type, content and perhaps framing policy of a page; None if there is none."""
         views = self.server.views
-        html, unframed = "text/html; charset=utf-8", "frame-ancestors 'none'"
+        html = "text/html; charset=utf-8"
         if path == "/":
-            return html, self.server.page.encode(), unframed
+            return html, self.server.page.encode()
         if path == "/state.json":
-            return "application/json", json.dumps(views.state()).encode(), unframed
-        if path == "/replay.html" and views.replayed.newest is not None:
-            return html, views.replayed.newest.page.encode(), "frame-ancestors 'self'"
-        name = path.removeprefix("/figures/").removesuffix(".png")
-        if path == f"/figures/{name}.png" and name in views.drawn.figures:
-            return "image/png", views.drawn.figures[name], unframed
-        return None
-
-    def _refuse(self) -> None:
-        """Refuses every method except GET."""
-        if not self._is_foreign():
-            text = b"This page is read-only: use GET.\n"
-            self._send(HTTPStatus.METHOD_NOT_ALLOWED, "text/plain", text, {"Allow": "GET"})
-
-    do_HEAD = do_POST = do_PUT = do_PATCH = do_DELETE = do_OPTIONS = do_TRACE = _refuse  # noqa: N815
-    do_CONNECT = _refuse  # noqa: N815
-
-    def _is_foreign(self) -> bool:
-        """Refuses a request that was meant for another host; returns whether it did."""
-        if self.headers.get_all("Host") in [[host] for host in self.server.hosts]:
-            return False
-        self._send(
-            HTTPStatus.MISDIRECTED_REQUEST, "text/plain", f"Open {self.server.url}\n".encode()
-        )
-        return True
+            return "application/json", json.dumps(views.state()).encode()
+        if path == "/replay.html" and views.replay:
+            return html, views.replay.encode(), "frame-ancestors 'self'"
+        figures = {f"/figures/{name}.png": png for name, png in views.figures.items()}
+        return ("image/png", figures[path]) if path in figures else None
 
     def _send(
-        self, status: HTTPStatus, kind: str, content: bytes, more: dict[str, str] | None = None
+        self, status: HTTPStatus, kind: str, content: bytes, framing: str = "frame-ancestors 'none'"
     ) -> None:
         self.send_response(status)
-        sent = {"Content-Type": kind, "Content-Length": str(len(content)), **_HEADERS}
-        for name, value in (sent | (more or {})).items():
+        about = {"Content-Type": kind, "Content-Length": str(len(content))}
+        for name, value in (about | _HEADERS | {"Content-Security-Policy": framing}).items():
             self.send_header(name, value)
         self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(content)
+        self.wfile.write(content)
 
     def log_message(self, format: str, *args: object) -> None:  # the library's names of arguments
         """Logs nothing about requests."""

@@ -1,11 +1,10 @@
-"""Keeps the figures and the replay of a page up to date, in threads, while the page is open."""
+"""Keeps the figures and the replay of a page up to date, in a thread, while the page is open."""
 
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from swarmjax.config import ConfigError
 from swarmjax.policy import PolicyError
@@ -16,46 +15,27 @@ from swarmjax.run.directory import METRICS, check_regular
 from swarmjax.run.errors import CheckpointError
 from swarmjax.watch import newest, status
 from swarmjax.watch.config import WatchConfig
-from swarmjax.watch.newest import Newest
 
 LOOKED_AT_S = 15.0  # the page counts as open for this long after its last request
 PAUSE_S = 0.5  # seconds between two checks of the directory
+REPLAY_S = 30.0  # shortest time between two replays
 # Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
 
 
-class DrawnFigures(NamedTuple):
-    """Figures of a run.
+class Views:
+    """The figures and the replay of a run.
 
     Attributes:
-      version: increases with each drawing.
+      settings: settings of the page.
+      run: the run directory.
+      trained: the run's config.
       history: the results that the figures show; None before the first update.
       figures: PNG files by name.
-      trouble: why the newest drawing failed; empty if it did not.
+      drawing: version of the figures, and why the newest drawing failed, if it did.
+      replay: the HTML page of the newest replay; empty before there is one.
+      replaying: version of the replay, what it shows, and why the newest one failed, if it did.
     """
-
-    version: int = 0
-    history: History | None = None
-    figures: Mapping[str, bytes] = {}
-    trouble: str = ""
-
-
-class Replayed(NamedTuple):
-    """A replay.
-
-    Attributes:
-      version: increases with each replay.
-      newest: the replay to show; None before there is one.
-      trouble: why the newest replay failed; empty if it did not.
-    """
-
-    version: int = 0
-    newest: Newest | None = None
-    trouble: str = ""
-
-
-class Views:
-    """The figures and the replay of a run, which threads keep up to date."""
 
     def __init__(self, settings: WatchConfig) -> None:
         """Reads the run's config.
@@ -66,80 +46,80 @@ class Views:
         self.settings, self.run = settings, Path(settings.run)
         check_regular(self.run)
         self.trained = rows.read_config(self.run)
-        self.drawn, self.replayed = DrawnFigures(), Replayed()
+        self.history: History | None = None
+        self.figures: dict[str, bytes] = {}
+        self.drawing: dict[str, Any] = {"version": 0, "trouble": ""}
+        self.replay = ""
+        self.replaying: dict[str, Any] = {"version": 0, "sentence": "", "trouble": ""}
         self._asked = -LOOKED_AT_S
-        self._seen: tuple[int, float] | None = None
-        self._tried: int | None = None
+        self._drawn: tuple[int, float] | None = None
+        self._replayed: int | None = None
 
     def follow(self) -> None:
-        """Starts the threads that update figures and replay while the page is open."""
-        for renew in (self.draw, self.replay):
-            threading.Thread(target=self._keep, args=(renew,), daemon=True).start()
+        """Starts the thread that updates figures and replay while the page is open."""
+        threading.Thread(target=self._keep, daemon=True).start()
 
     def state(self) -> dict[str, Any]:
         """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
-        drawn, replayed = self.drawn, self.replayed
         now = status.read(self.run, self.trained)
         return {
-            "state": now.state,
-            "sentence": now.sentence,
-            "facts": [] if drawn.history is None else report_page.facts(drawn.history),
-            "figures": {"version": drawn.version, "names": list(drawn.figures)},
-            "trouble": drawn.trouble,
-            "replay": {
-                "version": replayed.version,
-                "sentence": "" if replayed.newest is None else replayed.newest.sentence,
-                "trouble": replayed.trouble,
-            },
+            **now._asdict(),
+            "facts": [] if self.history is None else report_page.facts(self.history),
+            "figures": {"version": self.drawing["version"], "names": list(self.figures)},
+            "trouble": self.drawing["trouble"],
+            "replay": self.replaying,
         }
 
     def draw(self) -> float:
         """Redraws the figures if the run has logged more, and returns the seconds to rest."""
         version = _version(self.run / METRICS)
-        if version is None or version == self._seen:
+        if version is None or version == self._drawn:
             return 0.0
         from swarmjax.report import figures  # Matplotlib takes a second
 
         began = time.perf_counter()
         try:
             check_regular(self.run)
-            self.trained = rows.read_config(self.run)
-            history = rows.read(self.run)
-            self.drawn = DrawnFigures(self.drawn.version + 1, history, figures.png_files(history))
+            self.history = rows.read(self.run)
+            self.figures = figures.png_files(self.history)
+            self.drawing = {"version": self.drawing["version"] + 1, "trouble": ""}
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
-            self.drawn = self.drawn._replace(trouble=str(error))
-        self._seen = version
+            self.drawing |= {"trouble": str(error)}
+        self._drawn = version
         return (time.perf_counter() - began) * (1.0 - SHARE) / SHARE
 
-    def replay(self) -> float:
+    def record(self) -> float:
         """Replays the newest policy if it is new, and returns the seconds to rest."""
-        if self.drawn.history is None and not self.drawn.trouble:  # the history gives the stage
-            return 0.0
         from swarmjax.run import checkpoint  # JAX takes seconds to import
 
         update = max(checkpoint.steps(self.run), default=None)
-        if update is None or update == self._tried:
+        if update is None or update == self._replayed:
             return 0.0
-        self._tried = update
+        self._replayed = update
         try:
-            replay = newest.record(self.settings, self.drawn.history)
-            self.replayed = Replayed(self.replayed.version + 1, replay)
+            sentence, self.replay = newest.record(self.settings, self.history)
+            version = self.replaying["version"] + 1
+            self.replaying = {"version": version, "sentence": sentence, "trouble": ""}
         except (ConfigError, CheckpointError, PolicyError, OSError) as error:
-            self.replayed = self.replayed._replace(trouble=str(error))
-        return self.settings.seconds
+            self.replaying |= {"trouble": str(error)}
+        return REPLAY_S
 
-    def _keep(self, renew: Callable[[], float]) -> None:
+    def _keep(self) -> None:
         """Keeps updating forever, while the page is open."""
+        ready = {self.draw: 0.0, self.record: 0.0}
         while True:
-            rest = 0.0
-            if time.monotonic() - self._asked < LOOKED_AT_S:
+            time.sleep(PAUSE_S)
+            for renew, due in ready.items():
+                now = time.monotonic()
+                if now - self._asked > LOOKED_AT_S or now < due:
+                    continue
                 try:
                     rest = renew()
                 except Exception as error:  # unforeseen; the page must go on
                     sys.stderr.write(f"swarmjax.watch: {type(error).__name__}: {error}\n")
                     rest = LOOKED_AT_S
-            time.sleep(PAUSE_S + rest)
+                ready[renew] = time.monotonic() + rest
 
 
 def _version(path: Path) -> tuple[int, float] | None:

@@ -82,7 +82,7 @@ def test_a_grid_is_trained_and_tabled_and_not_trained_again(tmp_path: Path) -> N
     ]
     found = json.loads((folder / "sweep.json").read_text())
     assert found["codes"] == {"arenas=4": 0, "arenas=8": 0}
-    assert [cell["budget_spent"] for cell in found["cells"]] == [True, True]
+    assert [cell["updates"] == cell["budget"] for cell in found["cells"]] == [True, True]
 
     jobs = {*(folder / "jobs").iterdir()}
     again = subprocess.check_output(words, text=True)

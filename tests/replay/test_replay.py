@@ -121,14 +121,12 @@ def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
     assert _labels(capsys) == "; ".join(
         ["r1, level 4", "r1, level 0", "r1, level 7", "r2, level 4", "r2, level 0"]
     )
-    assert replay.main([*words, "cell=r2", "level=0", "steps=20"]) == 0
-    assert _labels(capsys) == "level 0"
 
 
 def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
     words = [f"policy={steer}", *QUICK, "shape=cross", "seed=5", "robot.hull_radius=0.035"]
     settings = load_levels(ReplayConfig, [*words, "level=7,2"])
-    every = cells.load(settings.evaluation).cells[0]
+    every = cells.draw_stage(settings.evaluation, range(8))
     drawn, draw = [], judge.draw_level
 
     def count(stage, spacing, seed, episode, *drawings):
@@ -155,9 +153,9 @@ def test_a_file_that_is_read_is_not_written_over(steer, suite, tmp_path):
         path.write_bytes(steer.read_bytes())
     same = f"{tmp_path}/../{tmp_path.name}/a"
     for words, sentence in {
-        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which is given as another",
+        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which swarmjax did not write",
         (f"policy={steer},{film}", f"out={tmp_path / 'b.html'}", f"video={film}"): (
-            f"video is {film}, which is given as another file: give a new name."
+            f"video is {film}, which swarmjax did not write"
         ),
         (f"policy={steer}", f"out={steer}"): f"out is {steer}: give a name that ends with .html.",
         (
@@ -198,19 +196,13 @@ def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
 
 def test_what_a_suite_has_not_is_refused(steer, suite):
     words = [f"policy={steer}", f"suite={suite}"]
-    for more, sentence in {
-        ("cell=r3",): "cell is 'r3': give one of r1, r2.",
-        ("worst=6",): f"worst is 6, but suite {suite} has 5 levels: give 1 to 5.",
-        ("worst=4", "cell=r1"): (
-            f"worst is 4, but suite {suite}, cell r1, has 3 levels: give 1 to 3."
-        ),
-        ("level=4",): f"suite {suite} has several cells: give worst=5, or cell=NAME of r1, r2.",
-        ("cell=r2", "level=7"): (
-            "level is 7, but cell r2 has the 2 levels 0 to 4: give one of them."
-        ),
-    }.items():
-        assert refusal(replay.main, [*words, *more]) == sentence
-    assert refusal(load_levels, ReplayConfig, [*words, "seed=3"]).startswith(
+    assert refusal(replay.main, [*words, "worst=6"]) == (
+        "worst is 6: give 1 to 5, the levels there are."
+    )
+    assert refusal(load_levels, ReplayConfig, [*words, "level=4"]) == (
+        f"suite is '{suite}': say which levels, as in worst=5."
+    )
+    assert refusal(load_levels, ReplayConfig, [*words, "worst=1", "seed=3"]).startswith(
         "seed cannot be given with"
     )
 
@@ -222,22 +214,15 @@ def test_defaults():
     assert settings.policies == ("a.npz", "b.npz")
     assert (settings.levels, settings.robot.body) == ((0,), "wheeled")
     assert settings.evaluation.step_limit == 1500
-    assert settings.evaluation.episodes == 1
-    assert load_levels(ReplayConfig, ["policy=a", "worst=5"]).evaluation.episodes == 1000
 
 
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["level=1000"], "level is 1000, but episodes is 1000: give 0 to 999."),
         (["level=x"], "level is 'x': give whole numbers with commas between them, as in 0,7,12."),
         (["level=-1"], "level is '-1': give whole numbers with commas between them, as in 0,7,12."),
-        (["level=2,2"], "level is '2,2': give each level once, 100 at most."),
         (["level=1", "worst=2"], "level is 1, but worst is 2: give one of the two."),
-        (["worst=6", "episodes=5"], "worst is 6, but episodes is 5: give 1 to 5."),
         (["worst=0"], "worst is 0: give 1 to 100."),
-        (["cell=s6"], "cell is 's6', but suite is null: give suite=NAME."),
-        (["video_speed=0"], "video_speed is 0: give 0.05 to 100."),
         (
             ["stage=curriculum"],
             "stage is curriculum, a curriculum: give one stage, as in stage=s6.",

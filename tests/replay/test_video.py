@@ -43,13 +43,12 @@ def test_the_camera_has_all_of_the_arena_in_its_picture():
 
 
 def test_pictures_are_spread_evenly_over_time():
-    settings = _settings("task.control_step=0.1", "video_speed=2")
+    settings = _settings("task.control_step=0.05")
     episode = replays.episode(replays.wandering(1, 11), replays.wandering(1, 6))
-    # At double speed a picture lasts 1/15 s of the episode, so 10 steps of 0.1 s make 15 pictures.
+    # A picture lasts 1/30 s, so 10 steps of 0.05 s make 15 pictures.
     rows = video.rows(settings, episode.runs)
     assert rows[:15] == [math.floor(k / 1.5) for k in range(15)]
     assert rows[15:] == [10] * 30  # the last frame is held for one second
-    assert video.count(settings, [episode] * 2) == 90
 
 
 def test_things_have_their_true_sizes():
@@ -109,7 +108,7 @@ run = replays.wandering(2, 4)
 run.pose[:, :, :2] = run.scene.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
 run.ray[:], run.touching[:] = 0.04, False
 run.touching[:, 1] = True
-settings = load_levels(ReplayConfig, ["policy=a", "video_speed=0.5"])
+settings = load_levels(ReplayConfig, ["policy=a", "task.control_step=0.064"])
 out = Path(sys.argv[1])
 video.write(out, settings, [replays.episode(run, run)])
 film = imageio.get_reader(out)
@@ -136,7 +135,7 @@ def test_a_film_shows_the_robots(tmp_path):
     assert done.returncode == 0, done.stderr
     with np.load(found) as arrays:
         count, picture = int(arrays["count"]), arrays["picture"].astype(int)
-    # Three steps of 0.032 s at half speed make 5.76 pictures of 1/30 s. The last frame is held for
+    # Three steps of 0.064 s make 5.76 pictures of 1/30 s. The last frame is held for
     # 0.1 s.
     assert count == 6 + 3
     assert picture.shape == (240, 2 * 320, 3)

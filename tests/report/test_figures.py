@@ -33,8 +33,7 @@ def _wide_row(success: list[float | None], **given: object) -> dict:
     """Returns a row with a stage for each share of success, and arenas spread evenly."""
     count = len(success)
     lists = {key: [None] * count for key in row(0) if key.endswith("_by_stage")}
-    even = {"mix": [1] * count, "weights": [1.0 / count] * count}
-    return row(0) | lists | even | {"success_by_stage": success} | given
+    return row(0) | lists | {"mix": [1] * count} | {"success_by_stage": success} | given
 
 
 def _lines(panel: Axes, colour: str, style: str) -> list[np.ndarray]:
@@ -93,24 +92,10 @@ def test_success_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> 
     assert bold == pytest.approx(np.array([[64, 0.3], [128, 0.5]]), rel=1e-6)
     assert [line[0, 1] for line in _lines(pair, THIN, "-")] == pytest.approx(shares, rel=1e-6)
     assert pair.get_title(loc="left") == "pair   50 %"
-    # The second stage has no arenas, so its earlier success is dotted. One seed has no success.
-    assert [len(line) for line in _lines(trio, BOLD, ":")] == [0]
-    assert [len(line) for line in _lines(trio, THIN, ":")] == [0, 1, 1, 1]
+    # One seed has no success on the second stage, so there is no mean.
+    assert [len(line) for line in _lines(trio, BOLD, "-")] == [0]
+    assert [len(line) for line in _lines(trio, THIN, "-")] == [0, 1, 1, 1]
     assert trio.get_title(loc="left") == "trio   25 %"
-
-
-def test_what_a_stage_was_left_with_is_dotted(tmp_path: Path) -> None:
-    rows = [
-        row(i, weights=[float(i == 0), float(i > 0)], success_by_stage=[0.5, None])
-        for i in range(10)
-    ]
-    pair, trio = report_figures.success(_history(tmp_path, rows)).axes
-    # The stage last had arenas at update 0. Its line stays solid for two more cohorts, of two
-    # updates each.
-    [[*lately]], [[*left]] = _lines(pair, BOLD, "-"), _lines(pair, BOLD, ":")
-    assert [x for x, _ in lately] == [64 * (i + 1) for i in range(5)]
-    assert [x for x, _ in left] == [64 * (i + 1) for i in range(5, 10)]
-    assert trio.get_title(loc="left") == "trio   not measured"
 
 
 @pytest.mark.parametrize(("stages", "promotes"), [(2, True), (1, False)])

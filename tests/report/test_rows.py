@@ -10,7 +10,6 @@ from sentences import refusal
 
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.report import rows as report_rows
-from swarmjax.task.stage_config import StageConfig
 
 NAN = np.nan
 
@@ -19,7 +18,7 @@ def test_rows_become_arrays_by_seed_and_update(tmp_path: Path) -> None:
     rows = [
         row(0, 8, mix=[8, 0]),
         row(0, 7, mix=[6, 2], success_by_stage=[0.5, None]),
-        row(1, 7, mix=[2, 6], weights=[0.25, 0.75], success_by_stage=[0.75, 0.125]),
+        row(1, 7, mix=[2, 6], success_by_stage=[0.75, 0.125]),
         row(1, 8, mix=[0, 8], contacts_by_stage=[2.0, None], complete_by_stage=[None, 0.25]),
     ]
     history = report_rows.read(write(tmp_path, rows))
@@ -30,7 +29,6 @@ def test_rows_become_arrays_by_seed_and_update(tmp_path: Path) -> None:
     assert history.seconds == 60.0
     expected = [[[0.75, 0.25], [0.25, 0.75]], [[1.0, 0.0], [0.0, 1.0]]]
     np.testing.assert_array_equal(history.mix, expected)
-    np.testing.assert_array_equal(history.weights[0], [[1.0, 0.0], [0.25, 0.75]])
     expected = [[[0.5, NAN], [0.75, 0.125]], [[NAN, NAN], [NAN, NAN]]]
     np.testing.assert_array_equal(history.success, expected)
     np.testing.assert_array_equal(history.by_stage["contacts_by_stage"][1, 1], [2.0, NAN])
@@ -58,10 +56,9 @@ def test_updates_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
 
 
 def test_all_null_is_no_measurement_and_no_share(tmp_path: Path) -> None:
-    history = report_rows.read(write(tmp_path, [row(0, mix=[None, None], weights=[None, None])]))
+    history = report_rows.read(write(tmp_path, [row(0, mix=[None, None])]))
     assert np.isnan(history.success).all()
     assert not history.mix.any()
-    assert not report_rows.trained_lately(history).any()
 
 
 def test_decisions_are_in_the_order_of_seeds_and_updates(tmp_path: Path) -> None:
@@ -69,14 +66,6 @@ def test_decisions_are_in_the_order_of_seeds_and_updates(tmp_path: Path) -> None
     history = report_rows.read(write(tmp_path, [row(0)], found))
     order = [(entry["seed"], entry["update"]) for entry in history.decisions]
     assert order == [(0, 2), (0, 5), (1, 0)]
-
-
-def test_a_verdict_is_of_the_networks_as_they_are_for_two_cohorts(tmp_path: Path) -> None:
-    # A cohort is two updates, and the first stage loses its arenas after update 1.
-    rows = [row(i, weights=[1.0, 0.0] if i <= 1 else [0.0, 1.0]) for i in range(8)]
-    lately = report_rows.trained_lately(report_rows.read(write(tmp_path, rows)))
-    assert lately[0, :, 0].tolist() == [True] * 6 + [False] * 2  # update 1 + 4 is the last
-    assert lately[0, :, 1].tolist() == [False] * 2 + [True] * 6
 
 
 def test_seeds_are_put_together_where_all_have_a_value() -> None:
@@ -90,12 +79,6 @@ def test_seeds_without_a_value_are_left_out_and_counted() -> None:
     mean, measured = report_rows.among(values)
     np.testing.assert_array_equal(mean, [2.5, 0.375, NAN])
     assert measured.tolist() == [4, 2, 0]
-
-
-def test_sides_are_written_as_points_and_ranges() -> None:
-    assert report_rows.side_text((1.0, 1.0)) == "1"
-    assert report_rows.side_text((0.5, 1.25)) == "0.5 to 1.25"
-    assert StageConfig(name="one", robots=2, side=0.7).sides == (0.7, 0.7)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +137,7 @@ def test_a_damaged_file_is_named_with_its_line(
         ({"train_s": NAN}, " has no number as train_s: it is damaged."),
         ({"mix": ["8", "0"]}, " has no list of 2 numbers as mix: it is damaged."),
         ({"mix": [8]}, " has no list of 2 numbers as mix: it is damaged."),
-        ({"weights": "x"}, " has no list of 2 numbers as weights: it is damaged."),
+        ({"mix": "x"}, " has no list of 2 numbers as mix: it is damaged."),
         (
             {"success_by_stage": [[1], [2, 3]]},
             " has no list of 2 numbers as success_by_stage: it is damaged.",

@@ -34,7 +34,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
         checkpoints.save(state, 0)
     made = Views(WatchConfig(run=str(run)))
     made.draw()
-    made.replay()
+    made.record()
     return made
 
 
@@ -52,17 +52,17 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 
 def test_the_newest_policy_of_the_first_seed_is_replayed(views: Views) -> None:
-    assert views.replayed.trouble == ""
-    newest = views.replayed.newest
-    assert newest is not None
-    assert newest.update == 0
-    assert newest.sentence == ("Level 0 of stage pair, by the policy of seed 0 after 0 updates.")
+    assert views.replaying == {
+        "version": 1,
+        "sentence": "Level 0 of stage pair, by the policy of seed 0 after 0 updates.",
+        "trouble": "",
+    }
 
 
 def test_a_policy_is_replayed_once(views: Views) -> None:
-    before = views.replayed
-    assert views.replay() == 0.0
-    assert views.replayed is before
+    before = views.replaying
+    assert views.record() == 0.0
+    assert views.replaying is before
 
 
 @chromium.needed
@@ -75,7 +75,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
     wait.until(lambda _: browser.execute_script(drawn) == 2)
     status = browser.find_element("id", "status")
-    assert status.text.startswith("It was killed, or broke, after 19 of 20 updates; ")
+    assert status.text.startswith("It was killed, or broke, after 19 of 20 updates. ")
     assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
     assert "by the policy of seed 0" in browser.find_element("id", "seen").text
     browser.switch_to.frame("replay")

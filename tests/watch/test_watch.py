@@ -140,12 +140,9 @@ def test_no_path_leads_elsewhere(server: Server, path: str) -> None:
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "", "[::1]:{port}"]
 )
-@pytest.mark.parametrize("method", ["GET", "POST"])
-def test_a_request_that_was_meant_for_another_host_is_refused(
-    server: Server, host: str, method: str
-) -> None:
+def test_a_request_that_was_meant_for_another_host_is_refused(server: Server, host: str) -> None:
     host = host.format(port=server.server_port)
-    assert _ask(server, "/state.json", method, host)[0] == 421
+    assert _ask(server, "/state.json", host=host)[0] == 421
 
 
 def test_localhost_is_this_machine(server: Server) -> None:
@@ -154,8 +151,7 @@ def test_localhost_is_this_machine(server: Server) -> None:
 
 @pytest.mark.parametrize("method", ["HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE"])
 def test_it_is_read_and_nothing_else(server: Server, method: str) -> None:
-    status, headers, _ = _ask(server, "/", method)
-    assert (status, headers["Allow"]) == (405, "GET")
+    assert _ask(server, "/", method)[0] == 501
 
 
 def test_the_name_of_a_run_is_text(server: Server) -> None:
@@ -171,10 +167,10 @@ def test_a_line_that_is_half_written_is_left_out(tmp_path: Path) -> None:
         file.write(json.dumps(row(2))[:40])
     views = Views(WatchConfig(run=str(run)))
     views.draw()
-    assert views.drawn.history is not None
-    assert views.drawn.history.updates.tolist() == [0, 1]
+    assert views.history is not None
+    assert views.history.updates.tolist() == [0, 1]
     assert views.state()["trouble"] == ""
-    assert status.progress(run, 1) == (2, 60.0)
+    assert status.progress(run, 1)[:2] == (2, 60.0)
 
 
 def test_updates_count_when_every_seed_has_written_them(tmp_path: Path) -> None:
@@ -201,10 +197,10 @@ def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None
     views = Views(WatchConfig(run=str(run)))
     views.draw()
     views.draw()
-    assert views.drawn.version == 1
+    assert views.drawing["version"] == 1
     write(run, [row(0), row(1)])
     views.draw()
-    assert views.drawn.version == 2
+    assert views.drawing["version"] == 2
 
 
 # How a run stands
@@ -220,13 +216,13 @@ def test_a_run_whose_lock_is_held_trains(tmp_path: Path) -> None:
         state, sentence = _state(run)
     assert state == "trains"
     # Two updates took 60 s of training, and 18 updates are left.
-    assert "It trains: 2 of 20 updates done, about 9 min 00 s left; the newest" in sentence
+    assert "It trains: 2 of 20 updates done, about 9 min 00 s left." in sentence
 
 
 def test_a_run_that_trains_and_has_written_nothing_says_so(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [])
     with directory.locked(run):
-        assert _state(run)[1] == "It trains: 0 of 20 updates done; no update is written yet."
+        assert _state(run)[1] == "It trains: 0 of 20 updates done."
 
 
 def test_a_run_whose_process_was_killed_says_so(tmp_path: Path) -> None:
@@ -243,7 +239,7 @@ def test_a_run_whose_process_was_killed_says_so(tmp_path: Path) -> None:
         holder.kill()
     state, sentence = _state(run)
     assert state == "killed"
-    assert sentence.startswith("It was killed, or broke, after 1 of 20 updates; the newest update")
+    assert sentence.startswith("It was killed, or broke, after 1 of 20 updates. ")
     assert sentence.endswith(f"Go on with: python -m swarmjax.train resume={run}")
 
 
@@ -267,16 +263,12 @@ def test_a_run_whose_summary_is_of_an_earlier_stop_was_killed(tmp_path: Path) ->
     assert _state(run)[0] == "killed"
 
 
-def test_a_run_that_was_removed_is_gone(tmp_path: Path) -> None:
-    assert _state(tmp_path / "run") == ("silent", f"{tmp_path / 'run'} is gone.")
-
-
 def test_a_run_whose_budget_is_spent_has_ended(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(update) for update in range(UPDATES)])
-    assert _state(run) == ("ended", "It has ended: all 20 updates are done.")
+    assert _state(run) == ("ended", "It has ended: 20 of 20 updates done.")
 
 
-@pytest.mark.parametrize(("age", "state"), [(0, "elsewhere"), (1000, "silent")])
+@pytest.mark.parametrize(("age", "state"), [(0, "trains"), (1000, "killed")])
 def test_a_run_on_another_machine_is_judged_by_what_it_writes(
     tmp_path: Path, age: int, state: str
 ) -> None:
@@ -284,9 +276,7 @@ def test_a_run_on_another_machine_is_judged_by_what_it_writes(
     (run / ".lock").write_text("process 1\nnode7\n")
     then = (run / "metrics.jsonl").stat().st_mtime - age
     os.utime(run / "metrics.jsonl", (then, then))
-    found, sentence = _state(run)
-    assert found == state
-    assert "1 of 20 updates done on node7" in sentence
+    assert _state(run)[0] == state
 
 
 def test_a_lock_of_an_older_version_is_of_this_machine(tmp_path: Path) -> None:
@@ -324,7 +314,7 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
         ConfigError,
         match=r"^the stored run .* the reward mine,",
     ):
-        newest.record(views.settings, views.drawn.history)
+        newest.record(views.settings, views.history)
     assert not mark.exists()
 
 
