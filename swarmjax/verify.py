@@ -5,7 +5,6 @@ Usage: python -m swarmjax.verify run=runs/NAME [updates=N]
 It exits with 0 if every state equals the saved one bit for bit, and with 1 otherwise.
 """
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -59,20 +58,14 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
     log = Path(settings.run) / directory.SAVED
     rows = directory.read_rows(log, None)
     try:
-        # After a checkpoint without arenas, a resumed run may have drawn new ones.
-        drawn = min((row["update"] for row in rows if row.get("arenas") is False), default=math.inf)
-        found = {
-            row["update"]: row["digest"]
-            for row in rows
-            if row["update"] < drawn and _is_replayable(row, trained)
-        }
+        found = {row["update"]: row["digest"] for row in rows if _is_replayable(row, trained)}
     except (KeyError, TypeError):
         raise CheckpointError(f"{log} is damaged: put the file back.") from None
     if not found:
         raise ConfigError(
             f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
             "the beginning could reproduce: give a run that has saved a checkpoint after its first "
-            "update, with its arenas, and with the budget and random streams of its config.json."
+            "update, with the budget and random streams of its config.json."
         )
     most = min(found) if settings.updates is None else settings.updates
     chosen = {update: found[update] for update in sorted(found) if update <= most}

@@ -135,18 +135,6 @@ def no_verdict(stages: int) -> CohortVerdict:
     return CohortVerdict(jnp.array(True), jnp.zeros(stages, bool), record.success, record)
 
 
-def restart(cohorts: Cohorts) -> Cohorts:
-    """Begins a cohort when all arenas are drawn again: their open episodes will never end."""
-    empty = _no_episodes(cohorts.record.success.shape[0])
-    return replace(
-        cohorts,
-        number=cohorts.number + 1,
-        age=jnp.zeros_like(cohorts.age),
-        previous=empty,
-        current=empty,
-    )
-
-
 def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
     """Adds ended episodes to the cohort and the stage in which they began.
 

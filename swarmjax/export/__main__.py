@@ -44,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     trained = settle(replace(trained, extensions=settings.extensions))
     targets = _targets(settings, trained)
     _check_free(settings, targets.values())
-    leaves, update, skipped = checkpoint.restore(run, settings.step)
+    leaves, update, skipped, *_ = checkpoint.find(run, settings.step)
     for sentence in skipped:
         sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
     for seed, out in targets.items():

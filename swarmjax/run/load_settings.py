@@ -19,8 +19,8 @@ AUTO = "auto"  # `arenas` and `resume` accept this word in place of a number or 
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "extensions")
 
-# The algo keys that a run with init_from must share with the run that it starts from.
-_SHARED = (
+# The algo keys that a run with init_from shares with the run that it starts from.
+NETWORK_KEYS = (
     "policy",
     "network",
     "hidden_sizes",
@@ -91,11 +91,6 @@ def load_train(
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         if auto and mapping.get("arenas") == AUTO:
             mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
-        if "init_from_std" in mapping and mapping.get("init_from") is None:
-            raise ConfigError(
-                f"init_from_std is {mapping['init_from_std']}, but there is no init_from: give "
-                "init_from=DIR with it, the directory of a run."
-            )
         if stages is not None:
             return mapping | {"stage": list(stages)}
         found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
@@ -117,7 +112,7 @@ def _inherited(typed: Sequence[str]) -> list[str]:
         held = from_stored(read_config(Path(source)))
     except ConfigError:  # `warm_start.read` reports it later, when the run begins
         return []
-    others = [key for key in to_dict(held.algo) if key not in _SHARED]
+    others = [key for key in to_dict(held.algo) if key not in NETWORK_KEYS]
     if held.algo.memory == "none" or any(
         word.startswith(("algo.memory=", "algo=")) for word in typed
     ):

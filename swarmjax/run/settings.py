@@ -31,19 +31,9 @@ class RunConfig(Section):
     checkpoint_minutes: float = field(
         default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
     )
-    checkpoint_share: float = field(
-        default=0.1,
-        metadata=about("share of the budget between checkpoints; 0: by time only", 0.0, 1.0),
-    )
     keep_checkpoints: int = field(
         default=2,
         metadata=about("how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT),
-    )
-    checkpoint_arenas: bool = field(
-        default=True,
-        metadata=about(
-            "save arenas in checkpoints; false: small files, and a resumed run draws new arenas"
-        ),
     )
     stop_after: int | None = field(
         default=None,
@@ -147,10 +137,6 @@ class TrainConfig(ProgramConfig):
     init_from: str | None = field(
         default=None,
         metadata=about("run directory to take the first networks and normaliser from"),
-    )
-    init_from_std: Literal["keep", "reset"] = field(
-        default="keep",
-        metadata=about("exploration after init_from; keep: as learned; reset: algo.initial_std"),
     )
     stage_name: str = field(
         default="",
