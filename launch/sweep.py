@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from swarmjax import command, outputs, words
-from swarmjax.config import ConfigError, Section, about, build, section
+from swarmjax.config import ConfigError, Section, about, build, check_text, section
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
 from swarmjax.policy import PolicyError
 from swarmjax.report import table
@@ -72,7 +72,7 @@ def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
     known = section.names(SweepConfig)
     mine = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     settings: SweepConfig = build(SweepConfig, {k: v for k, v in mine.items() if k in known})
-    section.check_text("dir", settings.dir)
+    check_text("dir", settings.dir)
     cells = multiply(
         Path(settings.dir), [word for word in arguments if word.partition("=")[0] not in known]
     )

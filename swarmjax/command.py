@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from typing import Any, TextIO
 
-from swarmjax.config import ConfigError, files, reading, section
+from swarmjax.config import ConfigError, files, reading, section, show
 from swarmjax.config.section import Section
 from swarmjax.exit_codes import FAILED, INTERRUPTED, USER_ERROR
 from swarmjax.policy import PolicyError
@@ -148,7 +148,7 @@ def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[s
         name = reading.called(str(error.filename))
         return f"{name} cannot be used: {error.strerror}.", USER_ERROR
     if isinstance(error, RuntimeError | AssertionError) and _lacks_platform():
-        named = section.show(os.environ["JAX_PLATFORMS"])
+        named = show(os.environ["JAX_PLATFORMS"])
         return (
             f"JAX_PLATFORMS is {named}, but JAX finds no such device here: give cpu, or unset it.",
             USER_ERROR,

@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmjax.config import reading, section
-from swarmjax.config.section import ConfigError, Section, show
+from swarmjax.config import reading, section, values
+from swarmjax.config.section import Section
+from swarmjax.config.values import ConfigError, check_text, show
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MOST_KEY = 200  # letters of a key on the command line
@@ -226,7 +227,7 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
-    section.check_text(group, choice)
+    check_text(group, choice)
     return read_yaml(Path(choice))
 
 
@@ -280,7 +281,7 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     Raises:
       ConfigError: if there is no such name.
     """
-    section.check_text(key, choice)
+    check_text(key, choice)
     if is_path(choice):
         return Path(choice)
     check_choice(folder, choice, key)
@@ -304,7 +305,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
     """
     names = choices(group)
     if is_path(choice):
-        section.check_text(key, choice)
+        check_text(key, choice)
         if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
     elif choice not in names:
@@ -344,9 +345,9 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
         if key in derived:
             raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
         if choices(key):
-            section.check_text(key, value)
+            check_text(key, value)
             found[key] = value.strip("'\"")
-        elif key in known and str in section.options(known[key].type):
+        elif key in known and str in values.options(known[key].type):
             found[key] = _text(key, value)
         else:
             found[key] = _value(key, value)
@@ -355,7 +356,7 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
 
 def _text(key: str, value: str) -> Any:
     """Reads a text, which needs no quotes, so that a path may contain any character."""
-    section.check_text(key, value)
+    check_text(key, value)
     if value == "null":
         return None
     return _value(key, value) if value[:1] in ("'", '"') else value

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, section, to_dict
+from swarmjax.config import ConfigError, check_text, to_dict
 from swarmjax.evaluate import trials
 from swarmjax.exit_codes import FAILED
 from swarmjax.pages import builder
@@ -71,7 +71,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
     words = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     resumed = words.get("resume", "null").strip("'\"")
     if resumed not in ("", "null"):
-        section.check_text("resume", resumed)
+        check_text("resume", resumed)
         stored = reproduce_rows.read_facts(Path(resumed))["settings"]
         return load_reproduce(arguments, stored), Path(resumed)
     given = load_reproduce(arguments)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax import extension
-from swarmjax.config import ConfigError, build, files, inherit, reading, section, show, to_dict
+from swarmjax.config import ConfigError, build, check_text, files, inherit, reading, show, to_dict
 from swarmjax.config.section import build_stored
 from swarmjax.ppo.config import AlgoConfig, resolve
 from swarmjax.run import recipes
@@ -61,7 +61,7 @@ def read_config(run: Path) -> dict:
       ConfigError: if there is none, or it is not a JSON object.
     """
     path = run / CONFIG
-    section.check_text("the run directory", str(run))
+    check_text("the run directory", str(run))
     if not path.exists():
         raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
     found = reading.read_json(path)

@@ -135,8 +135,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
          "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, "
-         "levels_per_rollout, realism, extensions, recipe, run, resume, init_from, "
-         "init_from_std."),
+         "levels_per_rollout, realism, extensions, recipe, run, resume, init_from."),
         # Words that are not YAML, or mean something else in other tools.
         (["algo.hidden_sizes=[64"], "algo.hidden_sizes is '[64', which cannot be read: did not "
          "find expected ',' or ']', line 2, column 1."),
