@@ -25,11 +25,11 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
     with working("starting"):
         from swarmjax.run.load_settings import load_run
 
-        settings, auto = load_run(arguments)
-        if settings.run.coordinator is not None and not rank.is_child():
+        settings = load_run(arguments)
+        if settings.run.distributed and not rank.is_child():
             return rank.supervise(stop)
         from swarmjax.run.execute import execute
-    return execute(settings, stop, auto=auto)
+    return execute(settings, stop)
 
 
 def _command() -> int:

@@ -15,7 +15,7 @@ from swarmjax.run.settings import TrainConfig
 GRID = "grid."
 MOST_CELLS = 256
 # Keys that this module sets for each cell.
-_OWN = ("resume", "run.dir", "run.coordinator", "run.processes", "run.process", "run.dry")
+_OWN = ("resume", "run.dir", "run.distributed", "run.dry")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,6 +100,6 @@ def _cells(folder: Path, grid: dict[str, list[str]], shared: Sequence[str]) -> l
         if run in cells:
             raise ConfigError(f"two cells of the grid would be {run}: give values that differ.")
         words = (*shared, *mine, "resume=auto", f"run.dir={run}")
-        settings, _ = load_run(words)
+        settings = load_run(words)
         cells[run] = GridCell(label=" ".join(mine), run=run, words=words, settings=settings)
     return list(cells.values())

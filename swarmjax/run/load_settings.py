@@ -8,13 +8,13 @@ from typing import Any
 from swarmjax import extension
 from swarmjax.config import ConfigError, build, check_text, files, inherit, reading, show, to_dict
 from swarmjax.config.section import build_stored
-from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.ppo.config import resolve
 from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import pieces, stage_files
 
-AUTO = "auto"  # `arenas` and `resume` accept this word in place of a number or a directory
+AUTO = "auto"  # `resume` accepts this word in place of a directory
 
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "extensions")
@@ -71,17 +71,12 @@ def read_config(run: Path) -> dict:
 
 
 def load_train(
-    overrides: Sequence[str],
-    *,
-    auto: bool = False,
-    stages: Sequence[dict[str, Any]] | None = None,
+    overrides: Sequence[str], *, stages: Sequence[dict[str, Any]] | None = None
 ) -> TrainConfig:
     """Makes the configuration of `swarmjax.train` from its `key=value` words.
 
     Args:
       overrides: the words.
-      auto: whether to accept `arenas=auto`. The config then has the smallest possible number of
-        arenas, `algo.num_minibatches`. `memory.fill` chooses the final number later.
       stages: plain data of the stages, in place of a file.
 
     Raises:
@@ -89,8 +84,6 @@ def load_train(
     """
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
-        if auto and mapping.get("arenas") == AUTO:
-            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
         if stages is not None:
             return mapping | {"stage": list(stages)}
         found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
@@ -158,7 +151,7 @@ def settle(settings: TrainConfig) -> TrainConfig:
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
     """Makes the configuration with which a stored run goes on.
 
-    `run.stop_after` is not kept: it interrupted the stored run, and would stop this one at once.
+    `run.stop_after` and `run.distributed` are not kept: they say how the stored run was trained.
 
     Args:
       stored: configuration of the run, as `to_dict` gave it.
@@ -177,7 +170,7 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
             )
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
-    run = kept["run"] | {"stop_after": None} | given.get("run", {})
+    run = kept["run"] | {"stop_after": None, "distributed": False} | given.get("run", {})
     spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
     return settle(build(TrainConfig, kept | spread | given | {"run": run}))
 
@@ -191,28 +184,24 @@ def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str,
 
 def load_run(
     overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
-) -> tuple[TrainConfig, bool]:
+) -> TrainConfig:
     """Makes the configuration of a new run or, with `resume=`, of a run that goes on.
 
     Args:
       overrides: `key=value` words; with `resume`, only for keys that may change.
       stages: plain data of the stages of a new run, in place of a file.
 
-    Returns:
-      The configuration, and whether the number of arenas is still to be chosen.
-
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
     resumed = _by_key(overrides).get("resume", "null").strip("'\"")
     if resumed not in ("", "null", AUTO):
-        return _go_on(Path(resumed), overrides), False
+        return _go_on(Path(resumed), overrides)
     overrides = recipes.expand(TrainConfig, overrides)
     given = _by_key(overrides)
     if resumed == AUTO:
         return _go_on_or_begin(overrides, given, stages)
-    auto = given.get("arenas", "").strip("'\"") == AUTO
-    return load_train(overrides, auto=auto, stages=stages), auto
+    return load_train(overrides, stages=stages)
 
 
 def _go_on(run: Path, overrides: Sequence[str]) -> TrainConfig:
@@ -230,19 +219,16 @@ def _by_key(words: Sequence[str]) -> dict[str, str]:
 
 def _go_on_or_begin(
     overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
-) -> tuple[TrainConfig, bool]:
+) -> TrainConfig:
     """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
     if given.get("run.dir", "null") in ("", "null"):
         raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
     begun = [word for word in overrides if word.partition("=")[0] != "resume"]
-    auto = given.get("arenas", "").strip("'\"") == AUTO
-    typed = load_train(begun, auto=auto, stages=stages)
+    typed = load_train(begun, stages=stages)
     run = Path(typed.run.dir or "")
     if not (run / CONFIG).exists():
-        return typed, auto
+        return typed
     stored = from_stored(read_config(run), "stored ")
-    if auto:
-        typed = replace(typed, arenas=stored.arenas)
     _check_unchanged(run, to_dict(typed), to_dict(stored))
     kept = replace(typed.run, id=stored.run.id)
     spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
@@ -250,7 +236,7 @@ def _go_on_or_begin(
         spread["streams"] = typed.streams
     spread["extensions"] = typed.extensions
     settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
-    return settle(settled), False
+    return settle(settled)
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from swarmjax import words
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, about
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
@@ -51,54 +51,17 @@ class RunConfig(Section):
     episodes: bool = field(
         default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")
     )
-    coordinator: Literal["auto"] | str | None = field(
-        default=None,
+    distributed: bool = field(
+        default=False,
         metadata=about(
-            "HOST:PORT of the first of several processes; auto: taken from Slurm, Open MPI or "
-            "Kubernetes; null: a single process"
+            "train with other processes; Slurm, Open MPI or Kubernetes names them, or "
+            "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID"
         ),
-    )
-    processes: int | None = field(
-        default=None, metadata=about("number of processes [coordinator=HOST:PORT]", 1, 2**16)
-    )
-    process: int | None = field(
-        default=None,
-        metadata=about("index of this process, from 0 [coordinator=HOST:PORT]", 0, 2**16),
     )
     deterministic: bool = field(
         default=False, metadata=about("make results on a GPU bit-for-bit repeatable; slower")
     )
     dry: bool = field(default=False, metadata=about("check and describe the run; train nothing"))
-    compile_cache: Literal["auto"] | str | None = field(
-        default="auto",
-        metadata=about("directory for compiled programs; auto: the user's cache; null: none"),
-    )
-    memory_share: float = field(
-        default=0.8,
-        metadata=about("share of the GPU's memory that arenas=auto fills", above=0.0, high=1.0),
-    )
-
-    def _check(self) -> None:
-        given = (self.processes, self.process)
-        if self.coordinator in (None, "auto"):
-            if given != (None, None):
-                where = "null" if self.coordinator is None else "auto"
-                raise ConfigError(
-                    f"processes is {show(self.processes)} and process {show(self.process)}, but "
-                    f"coordinator is {where}: give them only with coordinator=HOST:PORT."
-                )
-            return
-        host, _, port = str(self.coordinator).rpartition(":")
-        if not host or not port.isdecimal() or not 0 < int(port[:9]) < 2**16:
-            raise ConfigError(
-                f"coordinator is {show(self.coordinator)}: give HOST:PORT, auto or null."
-            )
-        if self.processes is None or self.process is None or self.process >= self.processes:
-            raise ConfigError(
-                f"coordinator is {show(self.coordinator)}, but processes is "
-                f"{show(self.processes)} and process {show(self.process)}: give the number of "
-                "processes, and the index of this one, counted from 0."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

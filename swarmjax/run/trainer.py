@@ -172,13 +172,6 @@ def prepare(
     return replace(compiled, seconds=seconds), state
 
 
-def measure(settings: TrainConfig) -> int:
-    """Compiles a config's program and returns the device memory that training needs, bytes."""
-    program, schedule = programs.load(settings, by_robot=settings.run.episodes)
-    template = jax.eval_shape(mesh.init(program), schedule)
-    return compile_chunk(program, schedule, template).total_bytes
-
-
 def train(
     run: Path,
     program: Built,

@@ -47,11 +47,6 @@ def test_a_run_holds_the_settings_and_not_the_recipe() -> None:
     assert "recipe" not in to_dict(load_train(["recipe=worlds"]))
 
 
-def test_a_recipe_may_leave_the_number_of_arenas_open(own: Path) -> None:
-    own.write_text("arenas: auto\n")
-    assert load_run([f"recipe={own}"])[1]
-
-
 def test_an_unknown_recipe_is_refused() -> None:
     known = ", ".join(files.choices("recipes"))
     assert refusal(load_train, ["recipe=world"]) == (

@@ -212,7 +212,7 @@ def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
     log = [json.loads(line) for line in (run / "checkpoints.jsonl").read_text().splitlines()]
     assert {row["budget"] for row in log} == {144, 160}
     settings = verify.VerifyConfig(run=str(run), updates=9)
-    found = verify.load_digests(settings, load_run([*TINY, "budget=160"])[0])
+    found = verify.load_digests(settings, load_run([*TINY, "budget=160"]))
     assert set(found) == {row["update"] for row in log if row["budget"] == 160} & set(range(1, 10))
 
 

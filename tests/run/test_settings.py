@@ -461,10 +461,7 @@ def test_help_gives_default_meaning_and_allowed_values():
     text = help_text(TrainConfig, "swarmjax.train", ["all"])
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
-    assert (
-        "arenas=128 arenas simulated at once; auto: by run.memory_share "
-        "(a whole number 1 to 1048576)" in lines
-    )
+    assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
         "run.chunk=auto updates per call of the compiled program "
         "(a whole number 1 to 2147483647, all or auto)" in lines
