@@ -332,7 +332,7 @@ def begin_tally(
     )
     if kept is None:
         return tally
-    rows, decisions = recorder.history(run, done, kept.logs)
+    rows, decisions = recorder.history(run, kept.logs)
     try:
         _add(settings, tally, rows, decisions)
         tally.earlier_s = float(rows[-1]["train_s"]) if rows else 0.0
@@ -361,7 +361,6 @@ def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Record
     return Recorder(
         run,
         episodes=settings.run.episodes,
-        update=done,
         logs=None if kept is None else kept.logs,
         loggers=_loggers(run, settings, done),
     )
