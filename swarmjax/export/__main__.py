@@ -1,9 +1,20 @@
 """`python -m swarmjax.export run=DIR`: exports a checkpoint as `policy.npz`, ONNX, C or for Webots.
 
-Usage: python -m swarmjax.export run=runs/NAME [format=onnx] [step=UPDATE] [seed=SEED] [out=FILE]
-       python -m swarmjax.export policy=policy.npz format=c [out=FOLDER]
-
 A run with several seeds gives `policy-seed0.npz` and so on; `seed` exports only one of them.
+
+Examples:
+  # write the policy of the newest checkpoint again
+  python -m swarmjax.export run=runs/first
+  # the policy of an older checkpoint
+  python -m swarmjax.export run=runs/first step=100
+  # one seed of several
+  python -m swarmjax.export run=runs/first seed=3
+  # for ONNX Runtime
+  python -m swarmjax.export policy=policy.npz format=onnx
+  # C99 for a robot's firmware
+  python -m swarmjax.export policy=policy.npz format=c out=firmware/policy_c
+  # a controller for Webots
+  python -m swarmjax.export policy=policy.npz format=webots
 """
 
 import re

@@ -5,6 +5,16 @@ going or may have been killed: the report leaves out a line that is not fully wr
 
 For several runs it prints a table: see `table`. With `out` it also writes the table there, as
 `report.html` and `report.json`.
+
+Examples:
+  # into runs/first/report
+  python -m swarmjax.report run=runs/first
+  # into a folder of your choice
+  python -m swarmjax.report run=runs/first out=reports/first
+  # also send it to the run's TensorBoard or W&B
+  python -m swarmjax.report run=runs/first send=true
+  # a table of several runs, arrays and sweeps
+  python -m swarmjax.report runs=runs/first,runs/array,'runs/cell*'
 """
 
 import json

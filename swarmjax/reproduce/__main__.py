@@ -2,6 +2,18 @@
 
 Trains every arm, evaluates its policies and writes the report. `minutes` or Ctrl-C stops it and
 saves everything computed so far. `resume=DIR` continues.
+
+Examples:
+  # all arms, ten seeds each: hours
+  python -m swarmjax.reproduce
+  # a first look, in minutes
+  python -m swarmjax.reproduce seeds=3 budget=100000
+  # two arms
+  python -m swarmjax.reproduce 'arms=[curriculum,baseline]'
+  # stop after 55 minutes, with all saved
+  python -m swarmjax.reproduce minutes=55 out=runs/paper
+  # go on with a reproduction that was stopped
+  python -m swarmjax.reproduce resume=runs/paper
 """
 
 import json

@@ -149,7 +149,7 @@ def settle(settings: TrainConfig) -> TrainConfig:
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
-    """Makes the configuration with which a stored run goes on.
+    """Makes the configuration with which a stored run goes on, by default in its own directory.
 
     `run.stop_after` and `run.distributed` are not kept: they say how the stored run was trained.
 
@@ -162,7 +162,7 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     """
     words = files.parse(TrainConfig, overrides)
     for key, value in words.items():
-        if key not in _RESUME_KEYS and not key.startswith("run."):
+        if not _may_change(key):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
                 f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of the "
@@ -171,8 +171,13 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
     run = kept["run"] | {"stop_after": None, "distributed": False} | given.get("run", {})
+    run["dir"] = given.get("run", {}).get("dir") or given.get("resume")
     spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
     return settle(build(TrainConfig, kept | spread | given | {"run": run}))
+
+
+def _may_change(key: str) -> bool:
+    return key in _RESUME_KEYS or key.startswith("run.")
 
 
 def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
@@ -195,21 +200,11 @@ def load_run(
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
     resumed = _by_key(overrides).get("resume", "null").strip("'\"")
-    if resumed not in ("", "null", AUTO):
-        return _go_on(Path(resumed), overrides)
-    overrides = recipes.expand(TrainConfig, overrides)
-    given = _by_key(overrides)
     if resumed == AUTO:
-        return _go_on_or_begin(overrides, given, stages)
-    return load_train(overrides, stages=stages)
-
-
-def _go_on(run: Path, overrides: Sequence[str]) -> TrainConfig:
-    """Makes the configuration with which the run in a directory goes on."""
-    settings = load_resume(read_config(run), overrides)
-    asked = _by_key(overrides).get("run.dir", "null") not in ("", "null")
-    directory = settings.run.dir if asked else None
-    return replace(settings, run=replace(settings.run, dir=directory or settings.resume))
+        return _go_on_or_begin(overrides, stages)
+    if resumed in ("", "null"):
+        return load_train(overrides, stages=stages)
+    return load_resume(read_config(Path(resumed)), overrides)
 
 
 def _by_key(words: Sequence[str]) -> dict[str, str]:
@@ -218,25 +213,23 @@ def _by_key(words: Sequence[str]) -> dict[str, str]:
 
 
 def _go_on_or_begin(
-    overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
+    overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None
 ) -> TrainConfig:
     """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
-    if given.get("run.dir", "null") in ("", "null"):
-        raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
-    begun = [word for word in overrides if word.partition("=")[0] != "resume"]
+    given = _by_key(recipes.expand(TrainConfig, overrides))
+    del given["resume"]
+    begun = [f"{key}={value}" for key, value in given.items()]
     typed = load_train(begun, stages=stages)
-    run = Path(typed.run.dir or "")
+    if typed.run.dir is None:
+        raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
+    run = Path(typed.run.dir)
     if not (run / CONFIG).exists():
         return typed
-    stored = from_stored(read_config(run), "stored ")
-    _check_unchanged(run, to_dict(typed), to_dict(stored))
-    kept = replace(typed.run, id=stored.run.id)
-    spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
-    if typed.streams is not None and "streams" in given:
-        spread["streams"] = typed.streams
-    spread["extensions"] = typed.extensions
-    settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
-    return settle(settled)
+    stored = read_config(run)
+    _check_unchanged(run, to_dict(typed), to_dict(from_stored(stored, "stored ")))
+    changes = [f"{key}={value}" for key, value in given.items() if _may_change(key)]
+    spent = [f"budget={typed.budget}", f"devices={typed.devices}"]
+    return load_resume(stored, [*changes, *spent, f"resume={files.write(str(run))}"])
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
