@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from swarmjax.config import reading, section, values
 from swarmjax.config.section import Section
@@ -27,18 +27,6 @@ _WHOLE = "algo"
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
-class Overrides(NamedTuple):
-    """Settings from one source, which override those of earlier sources.
-
-    Attributes:
-      choices: the file that the source chooses for a group, by group.
-      values: other settings, as nested plain data.
-    """
-
-    choices: dict[str, str]
-    values: dict[str, Any]
-
-
 def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Composes a command's files and words. Words override files.
 
@@ -53,23 +41,22 @@ def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any
       ConfigError: if a word, a choice or a file is invalid.
     """
     flat = parse(cls, overrides)
-    choices_of = {key: choice for key, choice in flat.items() if choices(key)}
-    typed = Overrides(choices_of, nest({k: v for k, v in flat.items() if k not in choices_of}))
-    first = Overrides(defaults(cls.command), {})
-    whole = _of_whole(cls, (first.choices | typed.choices).get(_WHOLE))
-    chosen = first.choices | whole.choices | typed.choices
+    first, typed = defaults(cls.command), {k: choice for k, choice in flat.items() if choices(k)}
+    by_whole, values = _read_whole(cls, (first | typed).get(_WHOLE))
+    chosen = first | by_whole | typed
     found: dict[str, Any] = {}
     for group, choice in chosen.items():
         check_choice(group, choice, group)
         if group != _WHOLE:
             found[group] = read_choice(group, choice)
-    return merge(merge(found, whole.values), typed.values), chosen
+    others = nest({key: value for key, value in flat.items() if key not in typed})
+    return merge(merge(found, values), others), chosen
 
 
-def _of_whole(cls: type[Section], choice: str | None) -> Overrides:
-    """Reads the file of a group that may set keys of all sections."""
+def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str], dict[str, Any]]:
+    """Reads the choices and values of a file of the group that may set keys of all sections."""
     if choice is None:
-        return Overrides({}, {})
+        return {}, {}
     check_choice(_WHOLE, choice, _WHOLE)
     found = read_choice(_WHOLE, choice)
     if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
@@ -78,8 +65,8 @@ def _of_whole(cls: type[Section], choice: str | None) -> Overrides:
     return of_file(found, Path(choice).parent if is_path(choice) else Path())
 
 
-def of_file(found: Mapping[str, Any], folder: Path) -> Overrides:
-    """Separates the choices in a file from its other settings.
+def of_file(found: Mapping[str, Any], folder: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    """Separates the choices of files that a file makes, by group, from its other settings.
 
     Args:
       found: the keys and values of the file.
@@ -90,7 +77,7 @@ def of_file(found: Mapping[str, Any], folder: Path) -> Overrides:
         for key, value in found.items()
         if isinstance(value, str) and choices(key)
     }
-    return Overrides(chosen, {key: value for key, value in found.items() if key not in chosen})
+    return chosen, {key: value for key, value in found.items() if key not in chosen}
 
 
 def check_shared(cls: type[Section], found: Mapping[str, Any], path: str | Path) -> None:

@@ -2,13 +2,13 @@
 
 import itertools
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
 _MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
-_MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
 _MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
 _SHOWN = 80  # letters of a value to show in a message
 # What messages call the types, and examples of lists by the type of their items.
@@ -104,22 +104,19 @@ def check_text(key: str, text: str) -> None:
       text: a path, a name, or several separated by commas.
 
     Raises:
-      ConfigError: if the text has a control character, is not valid Unicode, or is too long for a
-        file name or path.
+      ConfigError: if the text has a control character, a name that is too long, or no valid Unicode.
     """
     if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
         raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
     try:
-        paths = text.encode().split(b",")
+        names = re.split(b"[/,]", text.encode())
     except UnicodeEncodeError:
         raise ConfigError(f"{key} is {show(text)}: give text in UTF-8.") from None
-    names = [name for path in paths for name in path.split(b"/")]
-    for what, parts, most in (("path", paths, _MOST_PATH), ("name", names, _MOST_NAME)):
-        longest = max(map(len, parts))
-        if longest > most:
-            raise ConfigError(
-                f"{key} is {show(text)}, with a {what} of {longest} bytes: give at most {most}."
-            )
+    longest = max(map(len, names))
+    if longest > _MOST_NAME:
+        raise ConfigError(
+            f"{key} is {show(text)}, with a name of {longest} bytes: give at most {_MOST_NAME}."
+        )
 
 
 def describe(hint: object, bounds: str = "") -> str:

@@ -118,7 +118,7 @@ class TrainConfig(ProgramConfig):
         self._check_devices()
         self._check_budget()
         self._check_counts()
-        self._check_algo()
+        self._check_hearing()
         self._check_levels()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
@@ -204,14 +204,6 @@ class TrainConfig(ProgramConfig):
                 f"it equally: give at least {len(self.stage)}."
             )
 
-    def _check_algo(self) -> None:
-        self._check_hearing()
-        if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
-            raise ConfigError(
-                f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
-                f"32 bits: give at most {MAX_COUNT}."
-            )
-
     def _check_hearing(self) -> None:
         """Refuses options that a network with neighbour messages does not support."""
         count = self.task.neighbours.count
@@ -232,11 +224,4 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 f"budget is {self.budget}, but one update takes arenas x algo.rollout_length = "
                 f"{update} control steps: give at least {update}."
-            )
-        most = MAX_COUNT // (self.algo.epochs * self.algo.num_minibatches)
-        if self.updates > most:
-            raise ConfigError(
-                f"budget is {self.budget}, which is {self.updates} updates of {update} control "
-                f"steps, but gradient steps are counted in 32 bits, which is enough for {most} "
-                f"updates: give at most {most * update}."
             )
