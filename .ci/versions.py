@@ -26,7 +26,7 @@ UV = os.environ.get("UV", "uv")  # `uv run` sets it
 RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest", "playground": "highest"}
 # Libraries that share an environment with swarmjax: more extras, and what calls them.
 EXTRAS = {"playground": ["playground"]}
-TOLD = ("jax", "flax", "optax", "orbax-checkpoint", "chex", "numpy", "mujoco-mjx", "warp-lang")
+TOLD = ("jax", "flax", "optax", "chex", "numpy", "mujoco-mjx", "warp-lang")
 TOLD += ("matplotlib", "rich", "tensorboardx", "playground", "brax")
 # Tests of what calls JAX, Flax, Optax and MuJoCo most; brax is not installed, and a test that
 # switches JAX to 64 bits does so as only JAX 0.8 and later can.
@@ -38,7 +38,7 @@ TESTS = [
 ]
 TOOLS = ["hypothesis", "pytest", "pytest-xdist"]
 STAGE = "name: mine\nrobots: 3\nside: 0.8\nobstacles: 2\n"
-SMALL = ["algo.hidden_sizes=[16]", "task.step_limit=40", "run.compile_cache=null"]
+SMALL = ["algo.hidden_sizes=[16]", "task.step_limit=40"]
 PYTHON_CALLS = """
 import jax, swarmjax
 for robot in ("planar", "wheeled"):
@@ -73,7 +73,7 @@ COMMANDS = {
         *("swarmjax", "train", "stage=mine.yaml", "arenas=16", "devices=2", "budget=20480"),
         *("run.dir=runs/a", *SMALL),
     ],
-    "resume": ["swarmjax", "train", "resume=runs/a", "budget=40960", "run.compile_cache=null"],
+    "resume": ["swarmjax", "train", "resume=runs/a", "budget=40960"],
     "evaluate": ["swarmjax", "evaluate", "policy=runs/a/policy.npz", "episodes=4", "out=judged"],
     "replay": ["swarmjax", "replay", "policy=runs/a/policy.npz", "level=0,1"],
     "report": ["swarmjax", "report", "run=runs/a"],

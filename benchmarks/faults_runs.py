@@ -286,50 +286,35 @@ Damage = Callable[[Path, np.random.Generator], object]
 
 
 def _newest(damage: Damage, run: Path, random: np.random.Generator) -> set[int]:
-    """Damages the folders of the newest checkpoints: one, two or three of them."""
+    """Damages the newest checkpoints: one, two or three of them."""
     steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
     for step in steps:
-        damage(run / checkpoint.FOLDER / str(step), random)
+        damage(checkpoint.path_of(run, step), random)
     return set(steps)
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
-def _flip(folder: Path, random: np.random.Generator) -> None:
-    """Flips one bit in one file."""
-    file = _files(folder)[random.integers(len(_files(folder)))]
+def _flip(file: Path, random: np.random.Generator) -> None:
+    """Flips one bit of a file."""
     content = bytearray(file.read_bytes())
-    if content:
-        content[random.integers(len(content))] ^= 1 << int(random.integers(8))
+    content[random.integers(len(content))] ^= 1 << int(random.integers(8))
     file.write_bytes(content)
 
 
-def _cut(folder: Path, random: np.random.Generator) -> None:
-    """Truncates one file."""
-    file = _files(folder)[random.integers(len(_files(folder)))]
+def _cut(file: Path, random: np.random.Generator) -> None:
+    """Truncates a file."""
     content = file.read_bytes()
     file.write_bytes(content[: random.integers(len(content) + 1)])
 
 
-def _delete(folder: Path, random: np.random.Generator) -> None:
-    """Deletes some files."""
-    for file in _files(folder):
-        if random.random() < 0.3:
-            file.unlink()
-
-
-def _empty(folder: Path, _: np.random.Generator) -> None:
-    """Empties a folder."""
-    shutil.rmtree(folder)
-    folder.mkdir()
+def _empty(file: Path, _: np.random.Generator) -> None:
+    """Empties a file."""
+    file.write_bytes(b"")
 
 
 def _swap(run: Path, random: np.random.Generator) -> set[int]:
-    """Swaps the folders of two checkpoints."""
+    """Swaps two checkpoints."""
     steps = random.choice(checkpoint.steps(run), 2, replace=False)
-    first, second = (run / checkpoint.FOLDER / str(step) for step in steps)
+    first, second = (checkpoint.path_of(run, step) for step in steps)
     aside = run / checkpoint.FOLDER / "aside"
     first.rename(aside)
     second.rename(first)
@@ -341,18 +326,17 @@ def _rename(run: Path, random: np.random.Generator) -> set[int]:
     """Gives a checkpoint the name of another update."""
     step = int(random.choice(checkpoint.steps(run)))
     new = int(random.integers(1, 10 * UPDATES))
-    with contextlib.suppress(OSError):  # if a checkpoint of that name exists
-        (run / checkpoint.FOLDER / str(step)).rename(run / checkpoint.FOLDER / str(new))
+    if not checkpoint.path_of(run, new).exists():
+        checkpoint.path_of(run, step).rename(checkpoint.path_of(run, new))
     return {step, new}
 
 
 def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
     """Replaces a checkpoint with the checkpoint of the same update from another run."""
     step = int(random.choice(checkpoint.steps(run)))
-    given = _template() / source / checkpoint.FOLDER / str(step)
+    given = checkpoint.path_of(_template() / source, step)
     if given.exists():
-        shutil.rmtree(run / checkpoint.FOLDER / str(step))
-        shutil.copytree(given, run / checkpoint.FOLDER / str(step))
+        shutil.copy(given, checkpoint.path_of(run, step))
         return {step}
     return set()
 
@@ -360,11 +344,12 @@ def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
 def _mix(run: Path, random: np.random.Generator) -> set[int]:
     """Combines the arrays of one checkpoint with the metadata of another checkpoint."""
     first, second = map(int, random.choice(checkpoint.steps(run), 2, replace=False))
-    part = str(random.choice(["state", "meta"]))
-    shutil.rmtree(run / checkpoint.FOLDER / str(first) / part)
-    shutil.copytree(
-        run / checkpoint.FOLDER / str(second) / part, run / checkpoint.FOLDER / str(first) / part
-    )
+    with (
+        np.load(checkpoint.path_of(run, first)) as arrays,
+        np.load(checkpoint.path_of(run, second)) as other,
+    ):
+        mixed = {**arrays, "meta": other["meta"]}
+    np.savez(checkpoint.path_of(run, first), allow_pickle=False, **mixed)
     return {first}
 
 
@@ -377,7 +362,6 @@ def _config(run: Path, _: np.random.Generator) -> set[int]:
 _DAMAGES: dict[str, Callable[[Path, np.random.Generator], set[int]]] = {
     "flip": functools.partial(_newest, _flip),
     "cut": functools.partial(_newest, _cut),
-    "delete": functools.partial(_newest, _delete),
     "empty": functools.partial(_newest, _empty),
     "swap": _swap,
     "rename": _rename,

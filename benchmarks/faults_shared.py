@@ -50,13 +50,13 @@ _COMMANDS = {
 _SMALL = {
     "train": [
         *("arenas=8", "budget=32", "algo.rollout_length=2", "algo.num_minibatches=1", "seeds=1"),
-        *("task.step_limit=4", "run.dir=out", "run.compile_cache=null", "run.tensorboard=false"),
+        *("task.step_limit=4", "run.dir=out", "run.tensorboard=false"),
     ],
     "evaluate": ["steps=2", "workers=1", "out=out"],
 }
 _KEYS = [
-    *("extensions", "resume", "init_from", "recipe", "run.dir", "run.coordinator", "run.wandb"),
-    *("run.compile_cache", "stage", "robot", "algo", "realism", "curriculum.mode", "level", "name"),
+    *("extensions", "resume", "init_from", "recipe", "run.dir", "run.distributed", "run.wandb"),
+    *("stage", "robot", "algo", "realism", "curriculum.mode", "level", "name"),
     *("task.observations", "task.reward.extra", "algo.network", "defaults", "hydra"),
     *("cells", "map"),
     *("side", "body", "max_speed", "sequence", "grid", "seed", "devices", "digest", "<<", "import"),

@@ -14,9 +14,10 @@ if [ "$gpus" -lt 1 ]; then
 fi
 
 start() {
-  CUDA_VISIBLE_DEVICES="$1" exec "${PYTHON:-.venv/bin/python}" -m swarmjax.train devices="$gpus" \
-    run.dir="$run" resume=auto run.coordinator="127.0.0.1:${PORT:-12355}" \
-    run.processes="$gpus" run.process="$1" "${@:2}"
+  export CUDA_VISIBLE_DEVICES="$1" JAX_PROCESS_ID="$1" JAX_NUM_PROCESSES="$gpus"
+  export JAX_COORDINATOR_ADDRESS="127.0.0.1:${PORT:-12355}"
+  exec "${PYTHON:-.venv/bin/python}" -m swarmjax.train devices="$gpus" run.dir="$run" resume=auto \
+    run.distributed=true "${@:2}"
 }
 
 processes=()

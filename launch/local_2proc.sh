@@ -5,11 +5,11 @@
 set -euo pipefail
 run=${1:?give a run directory, as in: bash launch/local_2proc.sh runs/two}
 shift
-coordinator="127.0.0.1:${PORT:-12355}"
+export JAX_PLATFORMS=cpu JAX_COORDINATOR_ADDRESS="127.0.0.1:${PORT:-12355}" JAX_NUM_PROCESSES=2
 
 start() {
-  JAX_PLATFORMS=cpu uv run python -m swarmjax.train devices=2 run.dir="$run" resume=auto \
-    run.coordinator="$coordinator" run.processes=2 run.process="$1" "${@:2}"
+  JAX_PROCESS_ID="$1" uv run python -m swarmjax.train devices=2 run.dir="$run" resume=auto \
+    run.distributed=true "${@:2}"
 }
 
 start 1 "$@" &

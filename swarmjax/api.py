@@ -155,12 +155,12 @@ def train_policy(
     from swarmjax.run.settings import TrainConfig
 
     if isinstance(settings, TrainConfig):
-        config, auto = settings, False
+        config = settings
     else:
         more = {} if extensions is None else {"extensions": extensions}
-        config, auto = load_run(*_given({**_mapping(settings), **more}))
+        config = load_run(*_given({**_mapping(settings), **more}))
     run, paths = quiet.train(
-        config, on_update or (lambda row: None), _signals, loggers=_loggers(log), auto=auto
+        config, on_update or (lambda row: None), _signals, loggers=_loggers(log)
     )
     policies = [policy_file.read(file, config.extensions) for file in paths]
     lines = (run / "metrics.jsonl").read_text().splitlines()

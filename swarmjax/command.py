@@ -1,12 +1,15 @@
 """Handles `--help` and the user's errors (one sentence, exit code 2) for all commands."""
 
+import ast
 import contextlib
+import importlib.util
 import inspect
 import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
+from pathlib import Path
 from typing import Any, TextIO
 
 from swarmjax.config import ConfigError, files, reading, section
@@ -20,67 +23,6 @@ _LOST_WORKER = (
     "as in workers=1."
 )
 _ALL = "all"  # the help topic that lists every key
-# For each command's module: words to type after the module's name, and what they do.
-EXAMPLES: dict[str, dict[str, str]] = {
-    "swarmjax.train": {
-        "": "the default curriculum, into a new folder of runs/",
-        "stage=s6 robot=wheeled budget=8e6 arenas=512": "one stage, on wheels",
-        "run.dir=runs/first seeds=4": "four seeds at once, into a folder of your choice",
-        "stage=curriculum 'stage.sequence=[s1,s3,s6]'": "a curriculum of three stages",
-        "init_from=runs/first realism=real": "start from a trained run, on realistic robots",
-        "resume=runs/first": "go on with a run that was stopped",
-        "stage=s6 run.dry=true": "compile and print the memory that the run needs",
-    },
-    "swarmjax.evaluate": {
-        "policy=runs/first/policy.npz": "1,000 levels of its last stage, on wheels",
-        "policy=runs/first/policy.npz stage=s3 robot=planar": "another stage, and the planar body",
-        "policy=runs/first/policy.npz suite=headline out=judged": "a suite, with tables and plots",
-        "policy='runs/first/policy-seed*.npz'": "all seeds of a run together",
-        "compare=a.npz,b.npz": "two policies, level by level",
-        "policy=runs/first/policy.npz realism=real episodes=200": "with noise and latency",
-    },
-    "swarmjax.export": {
-        "run=runs/first": "write the policy of the newest checkpoint again",
-        "run=runs/first step=100": "the policy of an older checkpoint",
-        "run=runs/first seed=3": "one seed of several",
-        "policy=policy.npz format=onnx": "for ONNX Runtime",
-        "policy=policy.npz format=c out=firmware/policy_c": "C99 for a robot's firmware",
-        "policy=policy.npz format=webots": "a controller for Webots",
-    },
-    "swarmjax.report": {
-        "run=runs/first": "into runs/first/report",
-        "run=runs/first out=reports/first": "into a folder of your choice",
-        "runs=runs/first,runs/array": "a table of several runs, arrays and sweeps",
-    },
-    "swarmjax.watch": {
-        "run=runs/first": "serve a page on this machine, and print its address",
-        "run=runs/first port=8000": "on a port of your choice",
-    },
-    "swarmjax.replay": {
-        "policy=runs/first/policy.npz": "level 0 of its last stage, into replay.html",
-        "policy=runs/first/policy.npz level=0,7,12": "several levels",
-        "policy=runs/first/policy.npz worst=5": "its five worst levels out of 1,000",
-        "policy=a.npz,b.npz worst=3": "two policies side by side",
-        "policy=runs/first/policy.npz stage=s3 robot=planar": "another stage and body",
-        "policy=runs/first/policy.npz video=replay.mp4": "a video as well",
-    },
-    "swarmjax.reproduce": {
-        "": "all arms, ten seeds each: hours",
-        "seeds=3 budget=100000": "a first look, in minutes",
-        "'arms=[curriculum,baseline]'": "two arms",
-        "minutes=55 out=runs/paper": "stop after 55 minutes, with all saved",
-        "resume=runs/paper": "go on with a reproduction that was stopped",
-    },
-    "swarmjax.verify": {
-        "run=runs/first": "train it again up to its first checkpoint, and compare digests",
-        "run=runs/first updates=500": "up to update 500",
-    },
-    "swarmjax.suite": {
-        "suite=headline": "draw the levels, and check them against the digests in the suite's file",
-        "suite=headline out=headline.npz": "write all levels to a file that evaluate reads",
-        "suite=my_suite.yaml write=true": "put the digests into a suite of your own",
-    },
-}
 
 
 def run(
@@ -146,24 +88,7 @@ def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[s
         # A file cannot be read or written, and the command has not handled the error itself.
         name = reading.called(str(error.filename))
         return f"{name} cannot be used: {error.strerror}.", USER_ERROR
-    if isinstance(error, RuntimeError | AssertionError) and _lacks_platform():
-        named = section.show(os.environ["JAX_PLATFORMS"])
-        return (
-            f"JAX_PLATFORMS is {named}, but JAX finds no such device here: give cpu, or unset it.",
-            USER_ERROR,
-        )
     return None
-
-
-def _lacks_platform() -> bool:
-    """Returns whether JAX_PLATFORMS names no device of this machine."""
-    if not os.environ.get("JAX_PLATFORMS") or "jax" not in sys.modules:
-        return False
-    try:
-        sys.modules["jax"].devices()
-    except (RuntimeError, AssertionError):
-        return True
-    return False
 
 
 class _Stream:
@@ -175,21 +100,24 @@ class _Stream:
 
     def __init__(self, stream: TextIO | None) -> None:
         """Takes a stream; None if it was closed before the command began."""
-        self._stream = stream or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
         """Writes text, or drops it."""
-        self._try(lambda: self._stream.write(text))
+        with self._dropped():
+            self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Writes what is buffered, or drops it."""
-        self._try(self._stream.flush)
+        with self._dropped():
+            self._stream.flush()
 
-    def _try(self, write: Callable[[], object]) -> None:
+    @contextlib.contextmanager
+    def _dropped(self) -> Iterator[None]:
         try:
-            write()
+            yield
         except OSError as error:
             self.error = self.error or error
             # Python flushes the stream again at exit. This must not fail again.
@@ -283,15 +211,27 @@ def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
     return section.describe_keys(cls, chosen)
 
 
+def _examples(module: str) -> list[str]:
+    """Reads the examples in the docstring of a command's module, without importing JAX."""
+    if module.endswith(".py"):
+        return []
+    spec = importlib.util.find_spec(module)
+    if spec is not None and spec.submodule_search_locations:
+        spec = importlib.util.find_spec(f"{module}.__main__")
+    if spec is None or spec.origin is None:
+        return []
+    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text())) or ""
+    _, title, examples = text.partition("Examples:\n")
+    return f"{title}{examples}".splitlines()
+
+
 def _overview(cls: type[Section], module: str) -> list[str]:
     """Describes how to use a command, without the keys of its sections."""
     command = f"python {module}" if module.endswith(".py") else f"python -m {module}"
     lines = [f"usage: {command} key=value ..."]
-    examples = EXAMPLES.get(module, {})
+    examples = _examples(module)
     if examples:
-        lines += ["", "Examples:"]
-    for words, meaning in examples.items():
-        lines += [f"  # {meaning}", f"  {command} {words}".rstrip()]
+        lines += ["", *examples]
     groups = files.describe_groups(cls) if cls.command else []
     if groups:
         lines += ["", "Groups, each a folder of configs/:", *groups]

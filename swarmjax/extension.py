@@ -15,7 +15,7 @@ import re
 import sys
 import textwrap
 import types
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -130,15 +130,12 @@ def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], 
     Args:
       weight: factor on the function's value. `task.reward.extra.NAME` overrides it.
       name: name of the term; None: the function's name.
-
-    Raises:
-      TypeError: if the decorator is used without parentheses.
     """
-    if callable(weight):
-        raise TypeError("write @reward_term(weight=...), with a weight")
-    return lambda function: RewardTerm(
-        name=name or function.__name__, function=function, weight=weight
-    )
+
+    def make(function: Callable) -> RewardTerm:
+        return RewardTerm(name=name or function.__name__, function=function, weight=weight)
+
+    return make
 
 
 def observation(
@@ -156,20 +153,13 @@ def observation(
       offset: subtracted from the values, in that unit.
       scale: divisor of the values, in that unit.
       name: name of the observation; None: the function's name.
-
-    Raises:
-      TypeError: if the decorator is used without parentheses.
     """
-    if callable(size):
-        raise TypeError("write @observation(), with parentheses")
-    return lambda function: Observation(
-        name=name or function.__name__,
-        function=function,
-        size=size,
-        unit=unit,
-        offset=offset,
-        scale=scale,
-    )
+    numbers = {"size": size, "unit": unit, "offset": offset, "scale": scale}
+
+    def make(function: Callable) -> Observation:
+        return Observation(name=name or function.__name__, function=function, **numbers)
+
+    return make
 
 
 def level_drawing(function: Callable) -> LevelDrawing:
@@ -181,18 +171,17 @@ def level_drawing(function: Callable) -> LevelDrawing:
 
 
 def network(module: type) -> Network:
-    """Turns a Flax module into a network for actor and critic; `algo.network` selects it."""
-    return Network(name=_snake(module.__name__), function=module)
+    """Turns a Flax module into a network for actor and critic; `algo.network` selects it.
+
+    The name is that of the class in lower case, so that ResidualNet is residual_net.
+    """
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", module.__name__).lower()
+    return Network(name=name, function=module)
 
 
 def curriculum(function: Callable) -> OwnCurriculum:
     """Turns a function into a curriculum; `curriculum.mode` selects it."""
     return OwnCurriculum(name=function.__name__, function=function)
-
-
-def _snake(name: str) -> str:
-    """Turns the name of a class into the name of a key: ResidualNet into residual_net."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
 
 
 class Extensions(NamedTuple):
@@ -214,12 +203,11 @@ class Extensions(NamedTuple):
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""
-        kinds = zip(KINDS, self, strict=True)
+        every = [pieces for pieces in self if pieces]
         return ByName(
             {
-                kind.kind: ByName({piece.name: piece.digest for piece in pieces})
-                for kind, pieces in kinds
-                if pieces
+                pieces[0].kind: ByName({each.name: each.digest for each in pieces})
+                for pieces in every
             }
         )
 
@@ -277,13 +265,9 @@ def hand_over(given: object) -> str | None:
         return given
     if isinstance(given, Path):
         return str(given)
-    pieces: list[Any]
     if isinstance(given, types.ModuleType):
-        pieces = _pieces(vars(given))
-    elif isinstance(given, Piece):
-        pieces = [given]
-    else:
-        pieces = list(given) if isinstance(given, Iterable) else [given]
+        given = _pieces(vars(given))
+    pieces: list[Any] = list(given) if isinstance(given, Iterable) else [given]
     for piece in pieces:
         if not isinstance(piece, Piece):
             raise ConfigError(
@@ -359,19 +343,15 @@ def _check(piece: Piece, where: str) -> None:
         value = getattr(piece, key, 0.0)
         if type(value) not in (int, float) or not abs(value) <= _LARGEST:
             raise ConfigError(f"{label} has {key} {show(value)}: give a number that float32 holds.")
-    if isinstance(piece, Observation):
-        _check_observation(piece, label)
+    if isinstance(piece, Observation) and not (
+        isinstance(piece.size, int) and 1 <= piece.size <= 1000 and piece.scale
+    ):
+        raise ConfigError(
+            f"{label} has size {show(piece.size)} and scale {show(piece.scale)}: give a size of 1 "
+            "to 1000, and a scale other than 0, by which values are divided."
+        )
     if isinstance(piece, Network) and not isinstance(piece.function, type):
         raise ConfigError(f"{label} is not a class: decorate a flax.linen.Module.")
-
-
-def _check_observation(piece: Observation, label: str) -> None:
-    if not isinstance(piece.unit, str):
-        raise ConfigError(f"{label} has unit {show(piece.unit)}: give text.")
-    if not isinstance(piece.size, int) or not 1 <= piece.size <= 1000:
-        raise ConfigError(f"{label} has size {show(piece.size)}: give 1 to 1000.")
-    if not piece.scale:
-        raise ConfigError(f"{label} has scale 0, by which values are divided: give another number.")
 
 
 # Digests
@@ -388,7 +368,7 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
         ) from None
     found[thing.__name__] = ast.dump(_bare(tree))
     names = vars(sys.modules[thing.__module__]) if thing.__module__ in sys.modules else {}
-    for name in _names(tree):
+    for name in sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}):
         value = names.get(name)
         value = value.function if isinstance(value, Piece) else value
         if name in found or value is thing:
@@ -415,11 +395,6 @@ def _bare(tree: ast.Module) -> ast.Module:
     return tree
 
 
-def _names(tree: ast.AST) -> Iterator[str]:
-    """Yields the names that a tree reads, in alphabetical order."""
-    yield from sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name)})
-
-
 # What a policy needs
 
 
@@ -441,17 +416,17 @@ def check_needs(
       ConfigError: if a piece is missing or has changed.
     """
     held = pieces.digests()
-    for kind in kinds:
-        for name, digest in needs.get(kind, {}).items():
-            there = held.get(kind, {}).get(name)
-            if there is None:
-                raise ConfigError(
-                    f"{where} was trained with the {kind} {name}, which is not part of swarmjax: "
-                    "give extensions=FILE, the file that defines it."
-                )
-            if there != digest:
-                raise ConfigError(
-                    f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but the "
-                    f"{kind} in extensions has digest {there[:12]}: give the version of the file "
-                    "that was used for training."
-                )
+    wanted = ((kind, name) for kind in kinds for name in needs.get(kind, {}))
+    for kind, name in wanted:
+        digest, there = needs[kind][name], held.get(kind, {}).get(name)
+        if there is None:
+            raise ConfigError(
+                f"{where} was trained with the {kind} {name}, which is not part of swarmjax: give "
+                "extensions=FILE, the file that defines it."
+            )
+        if there != digest:
+            raise ConfigError(
+                f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but the "
+                f"{kind} in extensions has digest {there[:12]}: give the version of the file that "
+                "was used for training."
+            )

@@ -41,13 +41,14 @@ def commit() -> str | None:
     given = os.environ.get("SWARMJAX_COMMIT")
     if given:
         return given
-    tree = Path(__file__).resolve().parent
+    tree = str(Path(__file__).resolve().parent)
+    # Without tags, it describes the commit by its hash.
+    command = ["git", "-C", tree, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        head = _git(tree, "rev-parse", "--short=12", "HEAD")
-        changed = _git(tree, "status", "--porcelain", "--untracked-files=no")
+        found = subprocess.run(command, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return f"{head}-dirty" if changed else head
+    return found.stdout.strip()
 
 
 def device() -> str:
@@ -65,8 +66,3 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):  # only on Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _git(tree: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(tree), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

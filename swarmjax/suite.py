@@ -2,6 +2,14 @@
 
 The levels are checked against the digests in the suite's file. `write=true` writes new digests into
 it.
+
+Examples:
+  # draw the levels, and check them against the digests in the suite's file
+  python -m swarmjax.suite suite=headline
+  # write all levels to a file that evaluate reads
+  python -m swarmjax.suite suite=headline out=headline.npz
+  # put the digests into a suite of your own
+  python -m swarmjax.suite suite=my_suite.yaml write=true
 """
 
 import json

@@ -3,6 +3,22 @@
 Without arguments it trains the default curriculum. `--help` shows examples. JAX takes seconds to
 load, so it is imported only after the settings have passed their checks. Signals are handled even
 before the settings are checked.
+
+Examples:
+  # the default curriculum, into a new folder of runs/
+  python -m swarmjax.train
+  # one stage, on wheels
+  python -m swarmjax.train stage=s6 robot=wheeled budget=8e6 arenas=512
+  # four seeds at once, into a folder of your choice
+  python -m swarmjax.train run.dir=runs/first seeds=4
+  # a curriculum of three stages
+  python -m swarmjax.train stage=curriculum 'stage.sequence=[s1,s3,s6]'
+  # start from a trained run, on realistic robots
+  python -m swarmjax.train init_from=runs/first realism=real
+  # go on with a run that was stopped
+  python -m swarmjax.train resume=runs/first
+  # compile and print the memory that the run needs
+  python -m swarmjax.train stage=s6 run.dry=true
 """
 
 import sys
@@ -25,11 +41,11 @@ def _train(arguments: Sequence[str], stop: Stop) -> int:
     with working("starting"):
         from swarmjax.run.load_settings import load_run
 
-        settings, auto = load_run(arguments)
-        if settings.run.coordinator is not None and not rank.is_child():
+        settings = load_run(arguments)
+        if settings.run.distributed and not rank.is_child():
             return rank.supervise(stop)
         from swarmjax.run.execute import execute
-    return execute(settings, stop, auto=auto)
+    return execute(settings, stop)
 
 
 def _command() -> int:

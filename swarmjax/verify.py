@@ -1,11 +1,14 @@
 """`python -m swarmjax.verify run=DIR`: trains a run's first updates again and compares digests.
 
-Usage: python -m swarmjax.verify run=runs/NAME [updates=N]
-
 It exits with 0 if every state equals the saved one bit for bit, and with 1 otherwise.
+
+Examples:
+  # train it again up to its first checkpoint, and compare digests
+  python -m swarmjax.verify run=runs/first
+  # up to update 500
+  python -m swarmjax.verify run=runs/first updates=500
 """
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -57,14 +60,15 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
       CheckpointError: if its log is damaged.
     """
     log = Path(settings.run) / directory.SAVED
-    rows = directory.read_rows(log, None)
+    # A checkpoint cannot be reproduced if the run had lowered its learning rates, or used other
+    # random streams or another budget, over which the learning rates fall to 0.
+    same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
     try:
-        # After a checkpoint without arenas, a resumed run may have drawn new ones.
-        drawn = min((row["update"] for row in rows if row.get("arenas") is False), default=math.inf)
         found = {
             row["update"]: row["digest"]
-            for row in rows
-            if row["update"] < drawn and _is_replayable(row, trained)
+            for row in directory.read_rows(log, None)
+            if row["update"] > 0
+            and all(row.get(key, value) == value for key, value in same.items())
         }
     except (KeyError, TypeError):
         raise CheckpointError(f"{log} is damaged: put the file back.") from None
@@ -72,27 +76,16 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
         raise ConfigError(
             f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
             "the beginning could reproduce: give a run that has saved a checkpoint after its first "
-            "update, with its arenas, and with the budget and random streams of its config.json."
+            "update, with the budget and random streams of its config.json."
         )
-    most = min(found) if settings.updates is None else settings.updates
+    most = settings.updates or min(found)
     chosen = {update: found[update] for update in sorted(found) if update <= most}
     if not chosen:
         raise ConfigError(
-            f"updates is {settings.updates}, but the first checkpoint of {settings.run} is of "
-            f"update {min(found)}: give at least {min(found)}."
+            f"updates is {most}, but the first checkpoint of {settings.run} is of update "
+            f"{min(found)}: give at least {min(found)}."
         )
     return chosen
-
-
-def _is_replayable(row: directory.Row, trained: TrainConfig) -> bool:
-    """Returns whether training from the beginning reproduces a checkpoint.
-
-    A checkpoint cannot be reproduced if the run has lowered its learning rates, or used other
-    random streams or another budget. The budget matters because the learning rates fall to 0 over
-    the budget.
-    """
-    same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
-    return row["update"] > 0 and all(row.get(key, value) == value for key, value in same.items())
 
 
 def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
@@ -130,19 +123,18 @@ def main(arguments: Sequence[str]) -> int:
     saved = load_digests(settings, trained)
     found = replay(settle(trained), list(saved))
     differing = [update for update in saved if found[update] != saved[update]]
-    sys.stdout.write(_verdict(settings.run, list(saved), differing) + "\n")
-    return FAILED if differing else 0
-
-
-def _verdict(run: str, updates: list[int], differing: list[int]) -> str:
-    """Describes the result."""
     if differing:
-        return (
-            f"{run} differs from update {differing[0]} on: another version, device or config "
-            "trained it, or its device does not compute the same bits twice."
+        sys.stdout.write(
+            f"{settings.run} differs from update {differing[0]} on: another version, device or "
+            "config trained it, or its device does not compute the same bits twice.\n"
         )
-    what = words.count(len(updates), "checkpoint")
-    return f"{run} was reproduced bit for bit, up to update {updates[-1]:,} ({what} compared)."
+        return FAILED
+    what = words.count(len(saved), "checkpoint")
+    sys.stdout.write(
+        f"{settings.run} was reproduced bit for bit, up to update {max(saved):,} ({what} "
+        "compared).\n"
+    )
+    return 0
 
 
 if __name__ == "__main__":

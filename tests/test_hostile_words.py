@@ -11,7 +11,7 @@ from sentences import refusal
 from test_command import COMMANDS
 
 from swarmjax.command import run
-from swarmjax.config import section
+from swarmjax.config import section, values
 from swarmjax.policy import PolicyError
 from swarmjax.report import __main__ as report
 from swarmjax.report.config import ReportConfig
@@ -31,13 +31,13 @@ TEXTS = [
     (name, key)
     for name, (_, cls) in COMMANDS.items()
     for key, item in section.keys(cls).items()
-    if str in section.options(item.type)
+    if str in values.options(item.type)
 ]
 NUMBERS = [
     (name, key)
     for name, (_, cls) in COMMANDS.items()
     for key, item in section.keys(cls).items()
-    if {int, float} & {*section.options(item.type)}
+    if {int, float} & {*values.options(item.type)}
 ]
 
 

@@ -109,11 +109,12 @@ def test_a_job_is_asked_for_again_before_its_time_is_up(tmp_path: Path) -> None:
 
 def test_each_gpu_of_a_machine_gets_a_process(tmp_path: Path) -> None:
     path = tmp_path / "train"
-    path.write_text(f'#!/bin/sh\necho "$CUDA_VISIBLE_DEVICES $@" >> {tmp_path / "told"}\nexit 75\n')
+    told = "$CUDA_VISIBLE_DEVICES $JAX_PROCESS_ID $JAX_NUM_PROCESSES $JAX_COORDINATOR_ADDRESS $@"
+    path.write_text(f'#!/bin/sh\necho "{told}" >> {tmp_path / "told"}\nexit 75\n')
     path.chmod(0o755)
     job = _submit("local.sh", tmp_path, "runs/all", "arenas=64", PYTHON=str(path), GPUS="2")
     assert job.wait(timeout=60) == 75
-    common = "-m swarmjax.train devices=2 run.dir=runs/all resume=auto run.coordinator="
+    command = "-m swarmjax.train devices=2 run.dir=runs/all resume=auto run.distributed=true"
     assert sorted((tmp_path / "told").read_text().splitlines()) == [
-        f"{i} {common}127.0.0.1:12355 run.processes=2 run.process={i} arenas=64" for i in range(2)
+        f"{i} {i} 2 127.0.0.1:12355 {command} arenas=64" for i in range(2)
     ]

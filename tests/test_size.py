@@ -19,7 +19,7 @@ _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, toke
 CEILINGS = {
     "code lines of swarmjax": 22_450,
     "code lines of benchmarks": 4_500,
-    "keys of train": 166,
+    "keys of train": 159,
     "longest file": 584,
     "longest function": 60,
 }

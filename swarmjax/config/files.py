@@ -9,10 +9,11 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from swarmjax.config import reading, section
-from swarmjax.config.section import ConfigError, Section, show
+from swarmjax.config import reading, section, values
+from swarmjax.config.section import Section
+from swarmjax.config.values import ConfigError, check_text, show
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MOST_KEY = 200  # letters of a key on the command line
@@ -24,18 +25,6 @@ _WHOLE = "algo"
 
 # Takes the composed data and the choice of each group, and returns the keys and values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
-
-
-class Overrides(NamedTuple):
-    """Settings from one source, which override those of earlier sources.
-
-    Attributes:
-      choices: the file that the source chooses for a group, by group.
-      values: other settings, as nested plain data.
-    """
-
-    choices: dict[str, str]
-    values: dict[str, Any]
 
 
 def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -52,23 +41,22 @@ def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any
       ConfigError: if a word, a choice or a file is invalid.
     """
     flat = parse(cls, overrides)
-    choices_of = {key: choice for key, choice in flat.items() if choices(key)}
-    typed = Overrides(choices_of, nest({k: v for k, v in flat.items() if k not in choices_of}))
-    first = Overrides(defaults(cls.command), {})
-    whole = _of_whole(cls, (first.choices | typed.choices).get(_WHOLE))
-    chosen = first.choices | whole.choices | typed.choices
+    first, typed = defaults(cls.command), {k: choice for k, choice in flat.items() if choices(k)}
+    by_whole, values = _read_whole(cls, (first | typed).get(_WHOLE))
+    chosen = first | by_whole | typed
     found: dict[str, Any] = {}
     for group, choice in chosen.items():
         check_choice(group, choice, group)
         if group != _WHOLE:
             found[group] = read_choice(group, choice)
-    return merge(merge(found, whole.values), typed.values), chosen
+    others = nest({key: value for key, value in flat.items() if key not in typed})
+    return merge(merge(found, values), others), chosen
 
 
-def _of_whole(cls: type[Section], choice: str | None) -> Overrides:
-    """Reads the file of a group that may set keys of all sections."""
+def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str], dict[str, Any]]:
+    """Reads the choices and values of a file of the group that may set keys of all sections."""
     if choice is None:
-        return Overrides({}, {})
+        return {}, {}
     check_choice(_WHOLE, choice, _WHOLE)
     found = read_choice(_WHOLE, choice)
     if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
@@ -77,8 +65,8 @@ def _of_whole(cls: type[Section], choice: str | None) -> Overrides:
     return of_file(found, Path(choice).parent if is_path(choice) else Path())
 
 
-def of_file(found: Mapping[str, Any], folder: Path) -> Overrides:
-    """Separates the choices in a file from its other settings.
+def of_file(found: Mapping[str, Any], folder: Path) -> tuple[dict[str, str], dict[str, Any]]:
+    """Separates the choices of files that a file makes, by group, from its other settings.
 
     Args:
       found: the keys and values of the file.
@@ -89,7 +77,7 @@ def of_file(found: Mapping[str, Any], folder: Path) -> Overrides:
         for key, value in found.items()
         if isinstance(value, str) and choices(key)
     }
-    return Overrides(chosen, {key: value for key, value in found.items() if key not in chosen})
+    return chosen, {key: value for key, value in found.items() if key not in chosen}
 
 
 def check_shared(cls: type[Section], found: Mapping[str, Any], path: str | Path) -> None:
@@ -226,7 +214,7 @@ def read_choice(group: str, choice: str) -> dict[str, Any]:
     """
     if not is_path(choice):
         return read_file(f"{group}/{choice}")
-    section.check_text(group, choice)
+    check_text(group, choice)
     return read_yaml(Path(choice))
 
 
@@ -280,7 +268,7 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     Raises:
       ConfigError: if there is no such name.
     """
-    section.check_text(key, choice)
+    check_text(key, choice)
     if is_path(choice):
         return Path(choice)
     check_choice(folder, choice, key)
@@ -304,7 +292,7 @@ def check_choice(group: str, choice: str, key: str) -> None:
     """
     names = choices(group)
     if is_path(choice):
-        section.check_text(key, choice)
+        check_text(key, choice)
         if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
     elif choice not in names:
@@ -344,9 +332,9 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
         if key in derived:
             raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
         if choices(key):
-            section.check_text(key, value)
+            check_text(key, value)
             found[key] = value.strip("'\"")
-        elif key in known and str in section.options(known[key].type):
+        elif key in known and str in values.options(known[key].type):
             found[key] = _text(key, value)
         else:
             found[key] = _value(key, value)
@@ -355,7 +343,7 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
 
 def _text(key: str, value: str) -> Any:
     """Reads a text, which needs no quotes, so that a path may contain any character."""
-    section.check_text(key, value)
+    check_text(key, value)
     if value == "null":
         return None
     return _value(key, value) if value[:1] in ("'", '"') else value

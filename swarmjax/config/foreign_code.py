@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from swarmjax.config.section import ConfigError, show
+from swarmjax.config.values import ConfigError, show
 
 
 @contextlib.contextmanager

@@ -1,8 +1,7 @@
 """Reads untrusted files from users, with YAML or JSON in them.
 
 Only regular files are read, because reading a pipe could block forever, and only up to a maximum
-size. YAML is measured before it is loaded, because a few lines of it may expand to billions of
-values.
+size. YAML is measured before it is loaded.
 """
 
 import contextlib
@@ -15,16 +14,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
-from swarmjax.config.section import ConfigError, show
+from swarmjax.config.values import ConfigError, show
 
 MOST_TYPED = 2**20  # bytes in a file that a person writes; files of configs/ are 1000 times smaller
 MOST_MADE = 2**24  # bytes in a file that the project writes, such as a run's config
 _MOST_LINE = 2**24  # bytes in one line of a file with one object per line
-# Values in a YAML file, after its aliases are expanded. The largest file of configs/ has under 200.
+# Values in a YAML file. The largest file of configs/ has under 200.
 MOST_VALUES = 10_000
 _MOST_DEPTH = 32  # nested lists and mappings
 _TOO_DEEP = f"lists or mappings are nested more than {_MOST_DEPTH} deep."
-_MOST_DIGITS = 4300  # digits of a whole number; Python reads no more
 _MOST_SCALAR = 5000  # letters of one value; a path may have 4096
 
 
@@ -120,35 +118,24 @@ def parse_json(text: str, where: str) -> Any:
     try:
         found = json.loads(text)
     except RecursionError:
-        raise _too_deep(where) from None
+        raise ConfigError(f"{where} cannot be read: {_TOO_DEEP}") from None
     except json.JSONDecodeError as error:
         raise ConfigError(
             f"{where} cannot be read: it is not JSON, {str(error).lower()}."
         ) from None
     except ValueError:
         raise ConfigError(f"{where} cannot be read: a number has too many digits.") from None
-    _check_depth(found, where)
+    if _depth(found) > _MOST_DEPTH:  # it would break writing or comparing the value later
+        raise ConfigError(f"{where} cannot be read: {_TOO_DEEP}")
     return found
 
 
-def _check_depth(found: object, where: str) -> None:
-    """Refuses deep nesting, which would break writing or comparing the value later."""
-    level = [found]
-    for _ in range(_MOST_DEPTH + 1):
-        level = [inner for each in level for inner in _inside(each)]
-        if not level:
-            return
-    raise _too_deep(where)
-
-
-def _inside(value: object) -> Iterable[object]:
-    if isinstance(value, dict):
-        return value.values()
-    return value if isinstance(value, list) else ()
-
-
-def _too_deep(where: str) -> ConfigError:
-    return ConfigError(f"{where} cannot be read: {_TOO_DEEP}")
+def _depth(value: object, above: int = 0) -> int:
+    """Returns how deep lists and objects are nested; counts little further than allowed."""
+    inner = list(value.values()) if isinstance(value, dict) else value
+    if not isinstance(inner, list) or above > _MOST_DEPTH:
+        return above
+    return max((_depth(each, above + 1) for each in inner), default=above + 1)
 
 
 def read_lines(path: Path) -> Iterator[bytes]:
@@ -216,59 +203,33 @@ def parse_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}{_first_line(error)}.") from None
 
 
-class _Open:
-    """A list or mapping that is still open: its anchor, and the number of its values so far."""
-
-    def __init__(self, anchor: str | None) -> None:
-        self.anchor, self.values = anchor, 1
-
-
 def _measure(events: Iterable[Any], where: str) -> None:
-    """Refuses a YAML text that has tags, expands to too many values or is nested too deeply."""
+    """Refuses a YAML text that has tags or aliases, too many values, or is nested too deeply."""
     import yaml
 
-    anchors, within = dict[str | None, int](), [_Open(None)]
+    depth = count = 0
     for event in events:
         if getattr(event, "tag", None) is not None:
             raise ConfigError(f"{where}it has the tag {show(event.tag)}: remove it.")
-        if isinstance(event, yaml.CollectionStartEvent):
-            within.append(_Open(event.anchor))
-        elif isinstance(event, yaml.CollectionEndEvent):
-            ended = within.pop()
-            anchors[ended.anchor] = ended.values
-            within[-1].values += ended.values
-        elif isinstance(event, yaml.AliasEvent):
-            _check_ended(event.anchor, within, where)
-            within[-1].values += anchors.get(event.anchor, 1)
-        elif isinstance(event, yaml.ScalarEvent):
-            within[-1].values += 1
-            _check_scalar(event.value, where)
-        _check_room(within, where)
+        if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for billions
+            raise ConfigError(f"{where}it has the alias *{event.anchor}: write the value itself.")
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MOST_SCALAR:
+            raise ConfigError(f"{where}a value has more than {_MOST_SCALAR} characters.")
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        count += isinstance(event, yaml.CollectionStartEvent | yaml.ScalarEvent)
+        if depth > _MOST_DEPTH:
+            raise ConfigError(f"{where}{_TOO_DEEP}")
+        if count > MOST_VALUES:
+            raise ConfigError(f"{where}it has more than {MOST_VALUES} values.")
 
 
-def _check_ended(anchor: str, within: list[_Open], where: str) -> None:
-    if anchor in [each.anchor for each in within]:
-        raise ConfigError(f"{where}*{anchor} contains itself.")
-
-
-def _check_scalar(value: str, where: str) -> None:
-    if len(value) > _MOST_SCALAR:
-        raise ConfigError(f"{where}a value has more than {_MOST_SCALAR} characters.")
-
-
-def _check_room(within: list[_Open], where: str) -> None:
-    if len(within) > _MOST_DEPTH:
-        raise ConfigError(f"{where}{_TOO_DEEP}")
-    if within[-1].values > MOST_VALUES:
-        raise ConfigError(f"{where}it has more than {MOST_VALUES} values.")
-
-
-# The scalars of YAML 1.2's core schema (yaml.org/spec/1.2.2, section 10.3.2), by PyYAML's name for
-# them: the pattern, and the letters that may come first. Anything else is text.
+# The decimal scalars of YAML 1.2's core schema (yaml.org/spec/1.2.2, section 10.3.2), by PyYAML's
+# name for them: the pattern, and the letters that may come first. Anything else is text.
 _SCALARS = {
     "null": (r"null|Null|NULL|~|", ["n", "N", "~", ""]),
     "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
-    "int": (r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", [*"-+0123456789"]),
+    "int": (r"[-+]?[0-9]+", [*"-+0123456789"]),
     "float": (
         r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
         [*"-+0123456789."],
@@ -300,15 +261,9 @@ def _loader() -> Any:
     for name, (pattern, first) in _SCALARS.items():
         tag = f"tag:yaml.org,2002:{name}"
         Loader.add_implicit_resolver(tag, re.compile(f"^(?:{pattern})$"), first)
-    Loader.add_constructor("tag:yaml.org,2002:int", _whole_number)
+    # PyYAML would read 010 as 8, as in YAML 1.1.
+    Loader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))
     return Loader
-
-
-def _whole_number(_: Any, node: Any) -> int:
-    """Reads a whole number. PyYAML would read 010 as 8, as in YAML 1.1."""
-    if len(node.value) > _MOST_DIGITS:
-        raise ValueError(f"a number has more than {_MOST_DIGITS} digits")
-    return int(node.value, {"0o": 8, "0x": 16}.get(node.value[:2], 10))
 
 
 def _first_line(error: Exception) -> str:

@@ -7,27 +7,21 @@ what the settings are for.
 
 import dataclasses
 import difflib
-import itertools
 import math
 import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
+
+from swarmjax.config import values
+from swarmjax.config.values import ConfigError, check_text, show
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 # Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number by 0
 # if the number is nearer to 0 than `_SMALLEST`.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
-_MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
-_MOST_PATH = 4095  # bytes in a path on Linux, which allows the most
-_MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
 LAST_READER = "d8b3078"  # the last commit that reads runs and policies of older versions
-_SHOWN = 80  # letters of a value to show in a message
-
-
-class ConfigError(ValueError):
-    """Tells the user in one sentence why a setting is refused."""
 
 
 class UnknownKeyError(ConfigError):
@@ -44,23 +38,22 @@ class Bounds:
     below: float = math.inf
     reason: str = ""  # why `high` is the limit, and how to raise it
 
-    def hold(self, value: float) -> bool:
-        """Returns whether a number lies within the bounds and float32 can hold it."""
-        inside = self.low <= value <= self.high and self.above < value < self.below
-        return inside and _fits(value)
-
-    def refuse(self, key: str, value: object, number: float) -> ConfigError:
-        """Makes the error for a number out of bounds.
+    def check(self, key: str, value: object, number: float) -> None:
+        """Refuses a number out of bounds, or one that float32 cannot hold.
 
         Args:
           key: name of the setting in the message.
           value: the whole value that was given.
-          number: the number in it that is out of bounds.
+          number: the number in it to check.
         """
+        inside = self.low <= number <= self.high and self.above < number < self.below
+        fits = number == 0 or _SMALLEST <= abs(number) <= _LARGEST
+        if inside and fits:
+            return
         why = f"; {self.reason}" if self.reason and number > self.high else ""
-        if number != 0 and self.low <= number <= self.high and not _fits(number):
+        if inside:
             why = f"; float32 holds 0 and magnitudes of {_SMALLEST:g} to {_LARGEST:g}"
-        return ConfigError(f"{key} is {show(value)}: give {self}{why}.")
+        raise ConfigError(f"{key} is {show(value)}: give {self}{why}.")
 
     def __str__(self) -> str:
         if math.isfinite(self.low) and math.isfinite(self.high):
@@ -95,7 +88,7 @@ def about(  # most calls give two or three
       above: a number that the value must exceed.
       below: a number that the value must stay below.
       derived: whether the chosen files determine the value, so that the command line cannot set it.
-      stored: whether `to_dict` keeps the field. Fields that are not kept are computed again.
+      stored: whether `to_dict` keeps the field.
       reason: why `high` is the limit and how to raise it, for the error message.
     """
     bounds = Bounds(low, high, above, below, reason)
@@ -118,13 +111,10 @@ class Section:
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            value = getattr(self, item.name)
-            bounds = item.metadata.get("bounds", Bounds())
+            value, bounds = getattr(self, item.name), item.metadata.get("bounds", Bounds())
             for number in _leaves(value):
-                if isinstance(number, int | float) and not bounds.hold(number):
-                    raise bounds.refuse(item.name, value, number)
-            for ends in _ranges(item.type, value):
-                _check_range(item.name, ends)
+                if isinstance(number, int | float):
+                    bounds.check(item.name, value, number)
         self._check()
 
     def _check(self) -> None:
@@ -166,11 +156,6 @@ class ByName(dict[str, Any]):
         return hash(frozenset(self.items()))
 
 
-def _fits(number: float) -> bool:
-    """Returns whether a number is 0 or has a size that float32 holds."""
-    return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
-
-
 def _leaves(value: object) -> Iterator[object]:
     """Yields a value, or the values within nested tuples and `ByName`."""
     if isinstance(value, tuple | ByName):
@@ -180,26 +165,13 @@ def _leaves(value: object) -> Iterator[object]:
         yield value
 
 
-def _ranges(hint: object, value: object) -> Iterator[tuple[Any, ...]]:
-    """Yields the value itself if it is a range, otherwise the ranges within it."""
-    if isinstance(value, tuple) and _is_list(hint):
-        for item in value:
-            yield from _ranges(typing.get_args(hint)[0], item)
-    elif isinstance(value, tuple) and any(map(_is_range, options(hint))):
-        yield value
-
-
-def _check_range(key: str, value: tuple[Any, ...]) -> None:
-    if len(value) != 2:
-        raise ConfigError(f"{key} is {show(value)}: give two numbers.")
-    if value[0] > value[1]:
-        raise ConfigError(f"{key} is {show(value)}: give the lower number first.")
+# From and to plain data
 
 
 def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "") -> C:
     """Makes a section from plain data, strictly.
 
-    Whole floats and numeric strings become integers, integers become floats, and lists become
+    Whole numbers become integers or floats, numeric strings become numbers, and lists become
     tuples. Nothing else is converted, and no key is dropped.
 
     Args:
@@ -213,22 +185,20 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
     Raises:
       ConfigError: if a key is unknown or missing, or a value has a wrong type or is out of bounds.
     """
+    known = {item.name: item for item in dataclasses.fields(cls)}
     if not isinstance(mapping, Mapping):
         key = where.rstrip(": .")
-        example = dataclasses.fields(cls)[0].name
-        raise ConfigError(f"{key} is {show(mapping)}: give its keys, such as {where}{example}.")
-    known = {item.name: item for item in dataclasses.fields(cls)}
+        first = f"{where}{next(iter(known))}"
+        raise ConfigError(f"{key} is {show(mapping)}: give its keys, such as {first}.")
     for key in mapping:
         if key not in known:
             raise unknown_key(str(key), cls, where)
-    for item in known.values():
-        if item.name not in mapping and _is_required(item):
-            raise ConfigError(f"{where}{item.name} is missing and has no default: give it.")
-    values = {
-        key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()
-    }
+    for key, item in known.items():
+        if key not in mapping and _is_required(item):
+            raise ConfigError(f"{where}{key} is missing and has no default: give it.")
+    made = {key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()}
     try:
-        return cls(**values)
+        return cls(**made)
     except ConfigError as error:
         raise ConfigError(f"{where}{error}") from None
 
@@ -255,14 +225,58 @@ def build_stored[C: Section](cls: type[C], stored: Any, where: str) -> C:
         ) from None
 
 
+def convert(hint: object, value: object, key: str) -> object:
+    """Converts plain data to a field's type.
+
+    Args:
+      hint: the type.
+      value: the data.
+      key: name of the setting in messages.
+
+    Raises:
+      ConfigError: if the data cannot be converted.
+    """
+    lists = [each for each in values.options(hint) if values.is_list(each)]
+    if lists and not (value is None and types.NoneType in values.options(hint)):
+        return _listed(lists[0], value, key)
+    if typing.get_origin(hint) is dict:
+        return _by_name(typing.get_args(hint)[1], value, key)
+    section = _section(hint)
+    if section is not None:
+        mapping = typing.cast(Mapping[str, Any], value)
+        return build(section, mapping, key if key.endswith(": ") else f"{key}.")
+    return values.convert_single(hint, value, key)
+
+
+def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
+    """Converts a list of values of one type. One of several sections is called by its own name."""
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{key} is {show(value)}: give {values.describe(hint)}.")
+    inner = typing.get_args(hint)[0]
+    names = [key] * len(value)
+    if _section(hint) is not None and len(value) > 1:
+        numbered = enumerate(value)
+        own = (each.get("name", i) if isinstance(each, Mapping) else i for i, each in numbered)
+        names = [f"{key} {name}: " for name in own]
+    return tuple(convert(inner, item, name) for item, name in zip(value, names, strict=True))
+
+
+def _by_name(hint: object, value: object, key: str) -> ByName:
+    """Converts a mapping from names, which no section defines, to values of one type."""
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
+    for name in value:
+        check_text(key, str(name))
+    return ByName({str(name): convert(hint, each, f"{key}.{name}") for name, each in value.items()})
+
+
 def to_dict(config: Section) -> dict[str, Any]:
     """Returns a section as plain data for JSON. `build` reverses this."""
-    found = {}
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if item.metadata.get("stored", True):
-            found[item.name] = _plain(value)
-    return found
+    return {
+        item.name: _plain(getattr(config, item.name))
+        for item in dataclasses.fields(config)
+        if item.metadata.get("stored", True)
+    }
 
 
 def _plain(value: object) -> object:
@@ -271,9 +285,7 @@ def _plain(value: object) -> object:
         return to_dict(value)
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(item) for item in value]
-    return value
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 # Keys
@@ -343,12 +355,11 @@ def _key_line(cls: type[Section], key: str, item: dataclasses.Field[Any]) -> Key
     default = f"<{'required' if section == key else f'the {section}'}>"
     if section in cls.inherited and section != key:
         default = f"<{cls.inherited[section]}>"
-    elif item.default_factory is not dataclasses.MISSING:
-        default = show(item.default_factory(), quote="")
-    elif item.default is not dataclasses.MISSING:
-        default = show(item.default, quote="")
+    elif not _is_required(item):
+        made = item.default_factory() if callable(item.default_factory) else item.default
+        default = show(made, quote="")
     bounds = item.metadata.get("bounds", Bounds())
-    allowed = _describe(item.type, "" if bounds == Bounds() else f" {bounds}")
+    allowed = values.describe(item.type, "" if bounds == Bounds() else f" {bounds}")
     return KeyLine(key, default, item.metadata.get("meaning", ""), allowed)
 
 
@@ -389,196 +400,7 @@ def _is_required(item: dataclasses.Field[Any]) -> bool:
     return item.default is dataclasses.MISSING and item.default_factory is dataclasses.MISSING
 
 
-# Types
-
-
-def options(hint: object) -> tuple[Any, ...]:
-    """Returns the members of a union, or the type itself."""
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        return typing.get_args(hint)
-    return (types.NoneType,) if hint is None else (hint,)
-
-
 def _section(hint: object) -> type[Section] | None:
     """Returns the section type of a field, which may be within a tuple; None if it has none."""
     inner = typing.get_args(hint)[0] if typing.get_origin(hint) is tuple else hint
     return inner if isinstance(inner, type) and issubclass(inner, Section) else None
-
-
-def _is_range(hint: object) -> bool:
-    """Returns whether a type is a range: two numbers, the lower first."""
-    return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
-
-
-def _is_list(hint: object) -> bool:
-    return typing.get_origin(hint) is tuple and Ellipsis in typing.get_args(hint)
-
-
-def convert(hint: object, value: object, key: str) -> object:
-    """Converts plain data to a field's type.
-
-    Args:
-      hint: the type.
-      value: the data.
-      key: name of the setting in messages.
-
-    Raises:
-      ConfigError: if the data cannot be converted.
-    """
-    section, lists = _section(hint), [each for each in options(hint) if _is_list(each)]
-    if lists and not (value is None and type(None) in options(hint)):
-        return _listed(lists[0], value, key)
-    if typing.get_origin(hint) is dict:
-        return _by_name(typing.get_args(hint)[1], value, key)
-    if section is not None:
-        mapping = typing.cast(Mapping[str, Any], value)
-        return build(section, mapping, key if key.endswith(": ") else f"{key}.")
-    if hint is None and value is not None:
-        raise ConfigError(f"{key} is {show(value)}, but is not implemented yet: leave it out.")
-    if isinstance(value, str) and str in options(hint):
-        check_text(key, value)
-    for option in options(hint):
-        try:
-            return _scalar(option, value)
-        except (TypeError, ValueError, OverflowError):
-            continue
-    raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
-
-
-def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
-    """Converts a list of values of one type."""
-    if not isinstance(value, list | tuple):
-        raise ConfigError(f"{key} is {show(value)}: give {_describe(hint)}.")
-    inner = typing.get_args(hint)[0]
-    section = _section(hint)
-    return tuple(
-        convert(inner, item, _item_key(key, value, index) if section else key)
-        for index, item in enumerate(value)
-    )
-
-
-def _by_name(hint: object, value: object, key: str) -> "ByName":
-    """Converts a mapping from names, which no section defines, to values of one type."""
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
-    for name in value:
-        check_text(key, str(name))
-    return ByName({str(name): convert(hint, each, f"{key}.{name}") for name, each in value.items()})
-
-
-def _item_key(key: str, items: Sequence[Any], index: int) -> str:
-    """Returns the name of one of several sections: its own name, or its index."""
-    if len(items) == 1:
-        return key
-    item = items[index]
-    name = item.get("name", index) if isinstance(item, Mapping) else index
-    return f"{key} {name}: "
-
-
-def _scalar(hint: object, value: object) -> object:
-    """Converts to one scalar type or range, or raises an error for `convert` to explain."""
-    if typing.get_origin(hint) is Literal:
-        if isinstance(value, str) and value in typing.get_args(hint):
-            return value
-    elif _is_range(hint):
-        if isinstance(value, list | tuple) and len(value) == 2:
-            return tuple(_number(typing.get_args(hint)[0], number) for number in value)
-    elif hint is int or hint is float:
-        return _number(hint, value)
-    elif isinstance(hint, type) and isinstance(value, hint) and value != "":
-        return value
-    raise TypeError
-
-
-def check_text(key: str, text: str) -> None:
-    """Refuses text that cannot be a path or name, before the text is used.
-
-    Args:
-      key: name of the setting in messages.
-      text: a path, a name, or several separated by commas.
-
-    Raises:
-      ConfigError: if the text has a control character, is not valid Unicode, or is too long for a
-        file name or path.
-    """
-    if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
-        raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
-    try:
-        content = text.encode()
-    except UnicodeEncodeError:
-        raise ConfigError(f"{key} is {show(text)}: give text in UTF-8.") from None
-    for path in content.split(b","):
-        for parts, most in (([path], _MOST_PATH), (path.split(b"/"), _MOST_NAME)):
-            longest = max(map(len, parts))
-            if longest > most:
-                what = "path" if parts == [path] and most == _MOST_PATH else "name"
-                raise ConfigError(
-                    f"{key} is {show(text)}, with a {what} of {longest} bytes: give at most {most}."
-                )
-
-
-def _number(kind: type[int] | type[float], value: object) -> int | float:
-    """Converts a number or a numeric string. True and false are not numbers."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise TypeError
-    try:
-        number: int | float = int(value) if isinstance(value, str) else value
-    except ValueError:
-        number = float(value)
-    if isinstance(number, float) and not math.isfinite(number):
-        raise ValueError
-    if kind is int and number != int(number):
-        raise ValueError
-    return kind(number)
-
-
-# Words
-
-
-def _describe(hint: object, bounds: str = "") -> str:
-    """Describes a field's type in words, with the bounds of its numbers if given."""
-    if _is_list(hint):
-        examples = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
-        inner = typing.get_args(hint)[0]
-        return f"a list, as in {examples[inner]}{bounds}" if inner in examples else "a list"
-    if typing.get_origin(hint) is dict:
-        return "values by name"
-    words = []
-    for option in options(hint):
-        if _is_list(option):
-            words.append(_describe(option, bounds))
-        elif typing.get_origin(option) is Literal:
-            words += typing.get_args(option)
-        elif _is_range(option):
-            whole = "whole " if typing.get_args(option)[0] is int else ""
-            words.append(f"a range [low,high] of {whole}numbers{bounds}")
-        else:
-            names = {int: f"a whole number{bounds}", float: f"a number{bounds}", str: "text"}
-            words.append((names | {bool: "true or false", types.NoneType: "null"})[option])
-    *most, last = words
-    return f"{', '.join(most)} or {last}" if most else last
-
-
-def show(value: object, quote: str = "'") -> str:
-    """Formats a value as it would be typed, and shortens it.
-
-    Args:
-      value: plain data.
-      quote: the quotation mark around text.
-    """
-    if isinstance(value, str):
-        value = value[:_SHOWN]
-        text = value.encode("unicode_escape").decode("ascii") if not value.isprintable() else value
-        text = f"{quote}{text}{quote}"
-    elif value is None or isinstance(value, bool):
-        text = {None: "null", True: "true", False: "false"}[value]
-    elif isinstance(value, list | tuple):
-        text = f"[{','.join(show(item, quote) for item in value[:_SHOWN])}]"
-    elif isinstance(value, Mapping):
-        items = itertools.islice(value.items(), _SHOWN)
-        text = ", ".join(f"{show(key)}: {show(item)}" for key, item in items).join("{}")
-    elif isinstance(value, int) and value.bit_length() > _MOST_BITS:
-        text = f"a number of {round(value.bit_length() * math.log10(2))} digits"
-    else:
-        text = f"{value:.10g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."

@@ -135,12 +135,6 @@ def no_verdict(stages: int) -> CohortVerdict:
     return CohortVerdict(jnp.array(True), jnp.zeros(stages, bool), record.success, record)
 
 
-def restart(cohorts: Cohorts) -> Cohorts:
-    """Begins a cohort when all arenas are drawn again: their open episodes will never end."""
-    blank = init(cohorts.record.success.shape[0])
-    return replace(blank, number=cohorts.number + 1, record=cohorts.record)
-
-
 def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
     """Adds ended episodes to the cohort and the stage in which they began.
 

@@ -2,6 +2,20 @@
 
 `cells.py` draws the levels, `trials.py` runs the episodes, and `summary.py` summarises them. This
 module joins them, and writes and shows the result.
+
+Examples:
+  # 1,000 levels of its last stage, on wheels
+  python -m swarmjax.evaluate policy=runs/first/policy.npz
+  # another stage, and the planar body
+  python -m swarmjax.evaluate policy=runs/first/policy.npz stage=s3 robot=planar
+  # a suite, with tables and plots
+  python -m swarmjax.evaluate policy=runs/first/policy.npz suite=headline out=judged
+  # all seeds of a run together
+  python -m swarmjax.evaluate policy='runs/first/policy-seed*.npz'
+  # two policies, level by level
+  python -m swarmjax.evaluate compare=a.npz,b.npz
+  # with noise and latency
+  python -m swarmjax.evaluate policy=runs/first/policy.npz realism=real episodes=200
 """
 
 import json

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import epuck, extension, policy
-from swarmjax.config import ConfigError, build, reading, section, show, to_dict
+from swarmjax.config import ConfigError, build, check_text, reading, show, to_dict
 from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, read_suite
@@ -247,7 +247,7 @@ def read(path: Path) -> Suite:
     Raises:
       ConfigError: The file is unsound.
     """
-    section.check_text("suite", str(path))
+    check_text("suite", str(path))
     try:
         content = reading.read_bytes(path, MAX_BYTES)
     except ConfigError as error:

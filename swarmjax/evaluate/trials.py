@@ -165,7 +165,7 @@ def _by_mjx(
 
     for cell in cells:
         mine, outcomes = specialise(config, cell, entrants[0].path), []
-        with compile_cache.use(compile_cache.AUTO):
+        with compile_cache.use():
             world = engine_mjx.load(mine, cell.largest_half, len(cell.episodes))
             for each in entrants:
                 sampled, steps = config.action == "sampled", mine.step_limit

@@ -1,9 +1,20 @@
 """`python -m swarmjax.export run=DIR`: exports a checkpoint as `policy.npz`, ONNX, C or for Webots.
 
-Usage: python -m swarmjax.export run=runs/NAME [format=onnx] [step=UPDATE] [seed=SEED] [out=FILE]
-       python -m swarmjax.export policy=policy.npz format=c [out=FOLDER]
-
 A run with several seeds gives `policy-seed0.npz` and so on; `seed` exports only one of them.
+
+Examples:
+  # write the policy of the newest checkpoint again
+  python -m swarmjax.export run=runs/first
+  # the policy of an older checkpoint
+  python -m swarmjax.export run=runs/first step=100
+  # one seed of several
+  python -m swarmjax.export run=runs/first seed=3
+  # for ONNX Runtime
+  python -m swarmjax.export policy=policy.npz format=onnx
+  # C99 for a robot's firmware
+  python -m swarmjax.export policy=policy.npz format=c out=firmware/policy_c
+  # a controller for Webots
+  python -m swarmjax.export policy=policy.npz format=webots
 """
 
 import re
@@ -44,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     trained = settle(replace(trained, extensions=settings.extensions))
     targets = _targets(settings, trained)
     _check_free(settings, targets.values())
-    leaves, update, skipped = checkpoint.restore(run, settings.step)
+    leaves, update, skipped, *_ = checkpoint.find(run, settings.step)
     for sentence in skipped:
         sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
     for seed, out in targets.items():

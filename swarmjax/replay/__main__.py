@@ -3,6 +3,20 @@
 Runs the episodes in MuJoCo's C engine, as `evaluate` does, and writes one HTML file that plays them
 in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown side by side on the
 same levels. No JAX.
+
+Examples:
+  # level 0 of its last stage, into replay.html
+  python -m swarmjax.replay policy=runs/first/policy.npz
+  # several levels
+  python -m swarmjax.replay policy=runs/first/policy.npz level=0,7,12
+  # its five worst levels out of 1,000
+  python -m swarmjax.replay policy=runs/first/policy.npz worst=5
+  # two policies side by side
+  python -m swarmjax.replay policy=a.npz,b.npz worst=3
+  # another stage and body
+  python -m swarmjax.replay policy=runs/first/policy.npz stage=s3 robot=planar
+  # a video as well
+  python -m swarmjax.replay policy=runs/first/policy.npz video=replay.mp4
 """
 
 import sys

@@ -4,6 +4,14 @@ For one run it writes its figures, and `report.html`, which holds all of them. T
 going or may have been killed: the report leaves out a line that is not fully written. No JAX.
 
 For several runs it prints a table: see `table`.
+
+Examples:
+  # into runs/first/report
+  python -m swarmjax.report run=runs/first
+  # into a folder of your choice
+  python -m swarmjax.report run=runs/first out=reports/first
+  # a table of several runs, arrays and sweeps
+  python -m swarmjax.report runs=runs/first,runs/array
 """
 
 import sys

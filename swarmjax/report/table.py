@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import ConfigError, show, to_dict
-from swarmjax.config.section import check_text, keys
+from swarmjax.config import ConfigError, check_text, show, to_dict
+from swarmjax.config.section import keys
 from swarmjax.evaluate.statistics import LEAST_DRAWN, bootstrap
 from swarmjax.report import rows
 from swarmjax.report.rows import History

@@ -2,6 +2,18 @@
 
 Trains every arm, evaluates its policies and writes the report. `minutes` or Ctrl-C stops it and
 saves everything computed so far. `resume=DIR` continues.
+
+Examples:
+  # all arms, ten seeds each: hours
+  python -m swarmjax.reproduce
+  # a first look, in minutes
+  python -m swarmjax.reproduce seeds=3 budget=100000
+  # two arms
+  python -m swarmjax.reproduce 'arms=[curriculum,baseline]'
+  # stop after 55 minutes, with all saved
+  python -m swarmjax.reproduce minutes=55 out=runs/paper
+  # go on with a reproduction that was stopped
+  python -m swarmjax.reproduce resume=runs/paper
 """
 
 import json
@@ -19,7 +31,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, section, to_dict
+from swarmjax.config import ConfigError, check_text, to_dict
 from swarmjax.evaluate import trials
 from swarmjax.exit_codes import FAILED
 from swarmjax.pages import builder
@@ -71,7 +83,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
     words = {key: value for key, _, value in (word.partition("=") for word in arguments)}
     resumed = words.get("resume", "null").strip("'\"")
     if resumed not in ("", "null"):
-        section.check_text("resume", resumed)
+        check_text("resume", resumed)
         stored = reproduce_rows.read_facts(Path(resumed))["settings"]
         return load_reproduce(arguments, stored), Path(resumed)
     given = load_reproduce(arguments)

@@ -41,7 +41,7 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
         trainer += [f"stage={_STAGES[kind]}", f"budget={given.budget}"]
     else:
         trainer += ["stage=paper_expanded", f"budget={given.fine_tune}", f"init_from={out / first}"]
-    made, _ = load_run(
+    return load_run(
         [
             *trainer,
             "robot=paper",
@@ -53,7 +53,6 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
             "resume=auto",
         ]
     )
-    return made
 
 
 def run(made: TrainConfig, stop: Stop) -> None:
@@ -69,7 +68,7 @@ def run(made: TrainConfig, stop: Stop) -> None:
       TrainingError: if a loss is no longer finite.
     """
     with (
-        compile_cache.use(made.run.compile_cache),
+        compile_cache.use(),
         memory.refusal(made),
         Display(made.updates) as display,
     ):

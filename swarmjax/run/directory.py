@@ -18,7 +18,7 @@ import secrets
 import socket
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from swarmjax.config import ConfigError
 from swarmjax.outputs import replacing
@@ -51,19 +51,50 @@ def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
     Raises:
       ConfigError: if another process is writing the directory, or it cannot be written.
     """
-    made = _make(run) or [run, run.parent] * claimed
+    missing = [path for path in (run, *run.parents) if not path.exists()]
+    made = missing or [run, run.parent] * claimed
     with contextlib.ExitStack() as held:
-        while True:
-            file = held.enter_context(_open_lock(run))
-            _lock(run, file)
-            # Another process may have removed the file between opening and locking.
-            if _is_same(file, run / LOCK):
-                break
-        _sign(file)
+        try:
+            run.mkdir(parents=True, exist_ok=True)
+            _lock(run, held)
+        except OSError as error:
+            raise unwritable(run, error) from None
         try:
             yield
         finally:
             _remove_empty(run, made)
+
+
+def _lock(run: Path, held: contextlib.ExitStack) -> None:
+    """Locks a run directory, and writes into the lock which process holds it."""
+    path = run / LOCK
+    while True:
+        file = held.enter_context(path.open("a+"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.readline().strip() or "another process"
+            raise ConfigError(
+                f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
+                "directory."
+            ) from None
+        # Another process may have removed the file between opening and locking.
+        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+            break
+    with contextlib.suppress(OSError):  # a full disk; the lock works without a name
+        file.truncate(0)
+        file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
+        file.flush()
+
+
+def _remove_empty(run: Path, made: list[Path]) -> None:
+    """Removes the directories that were made, if the run then wrote nothing."""
+    with contextlib.suppress(OSError):  # already removed, or owned by another user
+        if made and os.listdir(run) == [LOCK]:
+            (run / LOCK).unlink()
+            for path in made:
+                path.rmdir()
 
 
 def claim(folder: Path, name: str) -> Path:
@@ -97,42 +128,12 @@ def visible(run: Path) -> list[str]:
         return []
 
 
-def _open_lock(run: Path) -> IO[str]:
-    try:
-        return (run / LOCK).open("a+")
-    except OSError as error:
-        raise unwritable(run, error) from None
-
-
-def _lock(run: Path, file: IO[str]) -> None:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        holder = file.readline().strip() or "another process"
-        raise ConfigError(
-            f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
-            "directory."
-        ) from None
-    except OSError as error:  # a file system without locks
-        raise unwritable(run, error) from None
-
-
-def _is_same(file: IO[str], path: Path) -> bool:
-    """Returns whether an open file is still the file at a path."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except OSError:
-        return False
-
-
 class Writer(NamedTuple):
     """The process that last wrote a run directory.
 
     Attributes:
       process: its process id on its machine.
-      host: its machine. Locks of older versions do not name the machine; this machine is then
-        assumed.
+      host: its machine.
     """
 
     process: int
@@ -147,61 +148,24 @@ class Writer(NamedTuple):
 def writer(run: Path) -> Writer | None:
     """Reads which process holds or held the lock of a run directory; None if unknown."""
     try:
-        process, *host = (run / LOCK).read_text().splitlines()
-        return Writer(int(process.removeprefix("process ")), (*host, socket.gethostname())[0])
-    except (OSError, ValueError, IndexError):
+        process, host = (run / LOCK).read_text().splitlines()
+        return Writer(int(process.removeprefix("process ")), host)
+    except (OSError, ValueError):
         return None
 
 
 def is_writing(found: Writer) -> bool:
-    """Returns whether a writer on this machine is still running.
+    """Returns whether the process of a writer on this machine is still running.
 
-    Where Linux lists locks, the process must hold one, because its id may have been reused.
     Acquiring the lock as a test would keep out a run that begins at the same moment.
     """
     try:
-        lines = Path("/proc/locks").read_text().splitlines()
-        return any(line.split()[1:5:3] == ["FLOCK", str(found.process)] for line in lines)
-    except OSError:
-        pass
-    try:
         os.kill(found.process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # the process belongs to another user
+    except PermissionError:  # the process belongs to another user
         return True
+    except (OSError, OverflowError):
+        return False
     return True
-
-
-def _make(run: Path) -> list[Path]:
-    """Makes a directory, and returns all directories that were made, innermost first."""
-    missing = [path for path in (run, *run.parents) if not path.exists()]
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        raise unwritable(run, error) from None
-    return missing
-
-
-def _sign(file: IO[str]) -> None:
-    """Writes into the lock which process holds it, for the message to the next process."""
-    try:
-        file.truncate(0)
-        file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
-        file.flush()
-    except OSError:  # a full disk; the lock works without a name
-        pass
-
-
-def _remove_empty(run: Path, made: list[Path]) -> None:
-    """Removes the directories that were made, if the run then wrote nothing."""
-    try:
-        if made and os.listdir(run) == [LOCK]:
-            (run / LOCK).unlink()
-            for path in made:
-                path.rmdir()
-    except OSError:  # already removed, or owned by another user
-        pass
 
 
 def check_regular(run: Path) -> None:
@@ -239,7 +203,7 @@ def kept_config(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
     """Makes the `config.json` of a resumed run.
 
     Args:
-      before: the stored config, written by any version.
+      before: the stored config.
       now: the config with which the run goes on.
 
     Returns:
@@ -320,29 +284,24 @@ def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
     Args:
       source: the old directory.
       run: the new directory. If a run has already begun there, nothing is copied.
-      logs: bytes to copy of each log, by name. Without them, whole logs are copied.
+      logs: bytes to copy of each log, by name.
     """
     if (run / CONFIG).exists():
         return
     for name in LOGS:
         if (source / name).exists():
-            found = (source / name).read_bytes()
             with replacing(run / name) as temporary:
-                temporary.write_bytes(found[: logs.get(name, 0)] if logs else found)
+                temporary.write_bytes((source / name).read_bytes()[: logs.get(name, 0)])
 
 
 def cut_rows(path: Path, update: int) -> None:
-    """Drops the rows of `update` and later, for older checkpoints that record no log lengths."""
+    """Drops the rows of `update` and later from a log, and damaged rows."""
     if path.exists():
-        rows = [row for row in read_rows(path, None, whole=False) if is_before(row, update)]
+        held = read_rows(path, None, whole=False)
+        dated = (row for row in held if isinstance(row.get("update"), int))
+        rows = [row for row in dated if row["update"] < update]
         with replacing(path) as temporary:
             temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def is_before(row: Row, update: int) -> bool:
-    """Returns whether a row belongs to an update before this one."""
-    found = row.get("update")
-    return isinstance(found, int) and found < update
 
 
 def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row]:

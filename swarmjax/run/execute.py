@@ -4,37 +4,31 @@ import math
 import sys
 from pathlib import Path
 
-import jax
-
 from swarmjax import command, words
 from swarmjax.config import ConfigError
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
 from swarmjax.run import checkpoint, compile_cache, directory, hosts, memory
-from swarmjax.run.display import Display, measured, spread, working
+from swarmjax.run.display import Display, measured, spread
 from swarmjax.run.errors import CheckpointError, LostPeerError, TrainingError
 from swarmjax.run.lifecycle import carry_out, dry_run, find_run
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop, StoppedError
-from swarmjax.run.trainer import Tally, measure
+from swarmjax.run.trainer import Tally
 
 
-def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
+def execute(settings: TrainConfig, stop: Stop) -> int:
     """Trains a run.
 
     Args:
       settings: the run's config.
       stop: notices signals.
-      auto: whether the number of arenas is still to be chosen.
 
     Returns:
       The exit code of the command.
     """
     hosts.join(settings)
-    with compile_cache.use(settings.run.compile_cache):
-        if auto:
-            settings, why = fill(settings)
-            sys.stdout.write(f"{why}\n")
+    with compile_cache.use():
         try:
             with hosts.lost_peers(), memory.refusal(settings):
                 return _run(settings, stop)
@@ -46,16 +40,6 @@ def execute(settings: TrainConfig, stop: Stop, *, auto: bool) -> int:
                 raise
             sys.stderr.write(f"swarmjax.train: error: {error}\n")
             return hosts.leave(USER_ERROR)
-
-
-def fill(settings: TrainConfig) -> tuple[TrainConfig, str]:
-    """Chooses the number of arenas.
-
-    Returns the settings with this number, and the reason for it.
-    """
-    available = None if jax.default_backend() == "cpu" else memory.limit()
-    with memory.refusal(settings), working("finding out how many arenas fit"):
-        return memory.fill(settings, measure, available)
 
 
 def _run(settings: TrainConfig, stop: Stop) -> int:

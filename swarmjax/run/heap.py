@@ -1,7 +1,7 @@
 """Limits the unused memory that glibc keeps for this process.
 
-glibc gives each thread its own heap, and a heap keeps the memory that was freed. XLA and
-TensorStore start dozens of threads. So half a gigabyte stays allocated after compiling, and a long
+glibc gives each thread its own heap, and a heap keeps the memory that was freed. XLA
+starts dozens of threads. So half a gigabyte stays allocated after compiling, and a long
 run seems to leak as its heaps fill up. A single heap is no solution, because compiling threads wait
 for its lock. With one heap on 32 cores, `stage=worlds` with a memory took 145 s to compile instead
 of 44 s. With another C library these functions do nothing.

@@ -10,7 +10,6 @@ import json
 import os
 import sys
 import tempfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,16 +23,18 @@ from swarmjax.run.errors import LostPeerError
 from swarmjax.run.load_settings import leaves
 from swarmjax.run.settings import TrainConfig
 
-AUTO = "auto"
 CHECKPOINTS = "checkpoints"  # folder in a run directory
 # A missing process is reported within a minute, and a lost one within half a minute.
 _JOIN_S, _HEARTBEAT_S = 45, 20
 # Keys that may differ between processes.
-_OWN = ("run.coordinator", "run.processes", "run.process", "run.id")
+_OWN = ("run.id",)
 
 
 def join(settings: TrainConfig) -> None:
-    """Joins the other processes of a run, if its settings name any.
+    """Joins the other processes of a run, with `run.distributed`.
+
+    JAX finds them as `jax.distributed.initialize` says. It reads `JAX_COORDINATOR_ADDRESS` itself,
+    but not how many processes there are without a cluster's scheduler, and which of them this is.
 
     Args:
       settings: the run's config.
@@ -41,16 +42,15 @@ def join(settings: TrainConfig) -> None:
     Raises:
       ConfigError: if the other processes do not join, or have other settings or versions.
     """
-    run = settings.run
-    if run.coordinator is None:
+    if not settings.run.distributed:
         return
     import jax
 
-    given: dict[str, Any] = {}
-    if run.coordinator != AUTO:
-        given["coordinator_address"] = run.coordinator
-        given |= {"num_processes": run.processes, "process_id": run.process}
+    names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
     try:
+        given: dict[str, Any] = {
+            key: int(os.environ[name]) for key, name in names.items() if name in os.environ
+        }
         jax.distributed.initialize(
             **given,
             initialization_timeout=_JOIN_S,
@@ -60,9 +60,9 @@ def join(settings: TrainConfig) -> None:
     except Exception as error:  # JAX's transport raises errors of many types
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise ConfigError(
-            f"run.coordinator is {show(run.coordinator)}, but the processes of the run did not "
-            f"connect within {_JOIN_S} s ({reason}): start all of them, and check the address and "
-            "the counts."
+            f"run.distributed is true, but the processes of the run did not connect within "
+            f"{_JOIN_S} s ({reason}): start all of them, and check JAX_COORDINATOR_ADDRESS, "
+            "JAX_NUM_PROCESSES and JAX_PROCESS_ID."
         ) from None
     rank.tell_joined()
     _check_alike(settings)
@@ -185,18 +185,16 @@ def leave(code: int) -> NoReturn:
 
 def _check_alike(settings: TrainConfig) -> None:
     """Refuses processes that would run different programs."""
-    mine = json.dumps(_comparable(settings), sort_keys=True)
-    first = share_text(mine)
-    digests = share(zlib.crc32(mine.encode()) >> 1)
-    other = [i for i, digest in enumerate(digests.tolist()) if digest != digests[0]]
-    if not other:
+    own = json.loads(json.dumps(_comparable(settings)))
+    theirs = json.loads(share_text(json.dumps(own)))
+    others = np.flatnonzero(share(own != theirs))
+    if not others.size:
         return
-    if mine == first:
+    if own == theirs:
         raise ConfigError(
-            f"process {other[0]} has other settings or versions than process 0: give all processes "
-            "the same."
+            f"process {others[0]} has other settings or versions than process 0: give all "
+            "processes the same."
         )
-    theirs, own = json.loads(first), json.loads(mine)
     key = next(key for key in own if own[key] != theirs.get(key))
     raise ConfigError(
         f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0: give all "

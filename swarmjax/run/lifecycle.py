@@ -27,7 +27,6 @@ from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.run.trainer import Built, Tally, begin_tally, compile_chunk, prepare, train
-from swarmjax.run.warm_start import Source
 from swarmjax.task import pieces
 from swarmjax.task.config import describe
 from swarmjax.training import mesh, seeds
@@ -103,7 +102,7 @@ def _train(
     run: Path,
     stop: Stop,
     display: Display,
-    source: Source | None,
+    source: Kept | None,
     kept: Kept | None,
 ) -> Tally:
     """Trains from a checkpoint, or from the seed, in which case `source` may give the networks."""
@@ -137,7 +136,7 @@ def _scaled(settings: TrainConfig, kept: Kept | None) -> TrainConfig:
 
 
 def _first_sentences(
-    program: Built, run: Path, source: Source | None, kept: Kept | None, skipped: list[str]
+    program: Built, run: Path, source: Kept | None, kept: Kept | None, skipped: list[str]
 ) -> Iterator[str]:
     """Describes what is trained, which engine steps the robots, and what the run starts from."""
     settings = program.config
@@ -146,13 +145,6 @@ def _first_sentences(
         yield f"from {settings.extensions}: {_own_pieces(settings)}"
     for sentence in skipped:
         yield f"{sentence}: it was passed over."
-    for sentence in [] if kept is None else kept.notes:
-        yield f"{sentence}."
-    if kept is not None and not kept.has_arenas:
-        yield (
-            "the checkpoint holds no arenas (run.checkpoint_arenas=false): new ones are drawn, and "
-            "the curriculum measures its stages again from here."
-        )
     if settings.resume is not None and kept is None:
         yield f"{settings.resume} has no checkpoint yet: the run begins from its seed."
     if kept is not None and settings.resume is not None:
@@ -161,8 +153,9 @@ def _first_sentences(
         updates = words.count(source.update, "update")
         as_there = describe(settings.robot, settings.task, settings.realism)
         yield (
-            f"starting with the networks and the normaliser of {source.run} after {updates}; "
-            f"robot, task, realism and network are as in that run, unless given here: {as_there}"
+            f"starting with the networks and the normaliser of {settings.init_from} after "
+            f"{updates}; robot, task, realism and network are as in that run, unless given here: "
+            f"{as_there}"
         )
 
 
@@ -259,7 +252,7 @@ def _first_state(
     schedule: Schedule,
     init: Callable[[Schedule], TrainState],
     template: TrainState,
-    source: Source | None,
+    source: Kept | None,
     kept: Kept | None,
 ) -> tuple[TrainState, list[str]]:
     """Makes the first state, from the seed or from the checkpoint of the resumed run.
@@ -275,11 +268,7 @@ def _first_state(
         if source is None:
             return state, []
         return warm_start.carry(source, state, settings), source.skipped
-    if kept.has_arenas:
-        return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), kept.skipped
-    without: Any = replace(template, arenas=None)
-    state = mesh.put(program, checkpoint.from_leaves(kept.leaves, without))
-    return mesh.draw_arenas(program, schedule, state), kept.skipped
+    return mesh.put(program, checkpoint.from_leaves(kept.leaves, template)), kept.skipped
 
 
 def find_run(settings: TrainConfig) -> Path:

@@ -6,22 +6,22 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax import extension
-from swarmjax.config import ConfigError, build, files, inherit, reading, section, show, to_dict
+from swarmjax.config import ConfigError, build, check_text, files, inherit, reading, show, to_dict
 from swarmjax.config.section import build_stored
 from swarmjax.curriculum.config import check_mode
-from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.ppo.config import resolve
 from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import pieces, stage_files
 
-AUTO = "auto"  # `arenas` and `resume` accept this word in place of a number or a directory
+AUTO = "auto"  # `resume` accepts this word in place of a directory
 
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "extensions")
 
-# The algo keys that a run with init_from must share with the run that it starts from.
-_SHARED = (
+# The algo keys that a run with init_from shares with the run that it starts from.
+NETWORK_KEYS = (
     "policy",
     "network",
     "hidden_sizes",
@@ -62,7 +62,7 @@ def read_config(run: Path) -> dict:
       ConfigError: if there is none, or it is not a JSON object.
     """
     path = run / CONFIG
-    section.check_text("the run directory", str(run))
+    check_text("the run directory", str(run))
     if not path.exists():
         raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
     found = reading.read_json(path)
@@ -72,17 +72,12 @@ def read_config(run: Path) -> dict:
 
 
 def load_train(
-    overrides: Sequence[str],
-    *,
-    auto: bool = False,
-    stages: Sequence[dict[str, Any]] | None = None,
+    overrides: Sequence[str], *, stages: Sequence[dict[str, Any]] | None = None
 ) -> TrainConfig:
     """Makes the configuration of `swarmjax.train` from its `key=value` words.
 
     Args:
       overrides: the words.
-      auto: whether to accept `arenas=auto`. The config then has the smallest possible number of
-        arenas, `algo.num_minibatches`. `memory.fill` chooses the final number later.
       stages: plain data of the stages, in place of a file.
 
     Raises:
@@ -90,13 +85,6 @@ def load_train(
     """
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
-        if auto and mapping.get("arenas") == AUTO:
-            mapping["arenas"] = build(AlgoConfig, mapping.get("algo", {}), "algo.").num_minibatches
-        if "init_from_std" in mapping and mapping.get("init_from") is None:
-            raise ConfigError(
-                f"init_from_std is {mapping['init_from_std']}, but there is no init_from: give "
-                "init_from=DIR with it, the directory of a run."
-            )
         if stages is not None:
             return mapping | {"stage": list(stages)}
         found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
@@ -118,7 +106,7 @@ def _inherited(typed: Sequence[str]) -> list[str]:
         held = from_stored(read_config(Path(source)))
     except ConfigError:  # `warm_start.read` reports it later, when the run begins
         return []
-    others = [key for key in to_dict(held.algo) if key not in _SHARED]
+    others = [key for key in to_dict(held.algo) if key not in NETWORK_KEYS]
     if held.algo.memory == "none" or any(
         word.startswith(("algo.memory=", "algo=")) for word in typed
     ):
@@ -164,9 +152,9 @@ def settle(settings: TrainConfig) -> TrainConfig:
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
-    """Makes the configuration with which a stored run goes on.
+    """Makes the configuration with which a stored run goes on, by default in its own directory.
 
-    `run.stop_after` is not kept: it interrupted the stored run, and would stop this one at once.
+    `run.stop_after` and `run.distributed` are not kept: they say how the stored run was trained.
 
     Args:
       stored: configuration of the run, as `to_dict` gave it.
@@ -177,7 +165,7 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     """
     words = files.parse(TrainConfig, overrides)
     for key, value in words.items():
-        if key not in _RESUME_KEYS and not key.startswith("run."):
+        if not _may_change(key):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
                 f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of the "
@@ -185,9 +173,14 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
             )
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
-    run = kept["run"] | {"stop_after": None} | given.get("run", {})
+    run = kept["run"] | {"stop_after": None, "distributed": False} | given.get("run", {})
+    run["dir"] = given.get("run", {}).get("dir") or given.get("resume")
     spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
     return settle(build(TrainConfig, kept | spread | given | {"run": run}))
+
+
+def _may_change(key: str) -> bool:
+    return key in _RESUME_KEYS or key.startswith("run.")
 
 
 def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
@@ -199,36 +192,22 @@ def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str,
 
 def load_run(
     overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
-) -> tuple[TrainConfig, bool]:
+) -> TrainConfig:
     """Makes the configuration of a new run or, with `resume=`, of a run that goes on.
 
     Args:
       overrides: `key=value` words; with `resume`, only for keys that may change.
       stages: plain data of the stages of a new run, in place of a file.
 
-    Returns:
-      The configuration, and whether the number of arenas is still to be chosen.
-
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
     resumed = _by_key(overrides).get("resume", "null").strip("'\"")
-    if resumed not in ("", "null", AUTO):
-        return _go_on(Path(resumed), overrides), False
-    overrides = recipes.expand(TrainConfig, overrides)
-    given = _by_key(overrides)
     if resumed == AUTO:
-        return _go_on_or_begin(overrides, given, stages)
-    auto = given.get("arenas", "").strip("'\"") == AUTO
-    return load_train(overrides, auto=auto, stages=stages), auto
-
-
-def _go_on(run: Path, overrides: Sequence[str]) -> TrainConfig:
-    """Makes the configuration with which the run in a directory goes on."""
-    settings = load_resume(read_config(run), overrides)
-    asked = _by_key(overrides).get("run.dir", "null") not in ("", "null")
-    directory = settings.run.dir if asked else None
-    return replace(settings, run=replace(settings.run, dir=directory or settings.resume))
+        return _go_on_or_begin(overrides, stages)
+    if resumed in ("", "null"):
+        return load_train(overrides, stages=stages)
+    return load_resume(read_config(Path(resumed)), overrides)
 
 
 def _by_key(words: Sequence[str]) -> dict[str, str]:
@@ -237,28 +216,23 @@ def _by_key(words: Sequence[str]) -> dict[str, str]:
 
 
 def _go_on_or_begin(
-    overrides: Sequence[str], given: Mapping[str, str], stages: Sequence[dict[str, Any]] | None
-) -> tuple[TrainConfig, bool]:
+    overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None
+) -> TrainConfig:
     """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
-    if given.get("run.dir", "null") in ("", "null"):
+    given = _by_key(recipes.expand(TrainConfig, overrides))
+    del given["resume"]
+    begun = [f"{key}={value}" for key, value in given.items()]
+    typed = load_train(begun, stages=stages)
+    if typed.run.dir is None:
         raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
-    begun = [word for word in overrides if word.partition("=")[0] != "resume"]
-    auto = given.get("arenas", "").strip("'\"") == AUTO
-    typed = load_train(begun, auto=auto, stages=stages)
-    run = Path(typed.run.dir or "")
+    run = Path(typed.run.dir)
     if not (run / CONFIG).exists():
-        return typed, auto
-    stored = from_stored(read_config(run), "stored ")
-    if auto:
-        typed = replace(typed, arenas=stored.arenas)
-    _check_unchanged(run, to_dict(typed), to_dict(stored))
-    kept = replace(typed.run, id=stored.run.id)
-    spread = _spread_again(stored.streams, typed.devices, stored.seeds_by)
-    if typed.streams is not None and "streams" in given:
-        spread["streams"] = typed.streams
-    spread["extensions"] = typed.extensions
-    settled = replace(stored, budget=typed.budget, resume=str(run), run=kept, **spread)
-    return settle(settled), False
+        return typed
+    stored = read_config(run)
+    _check_unchanged(run, to_dict(typed), to_dict(from_stored(stored, "stored ")))
+    changes = [f"{key}={value}" for key, value in given.items() if _may_change(key)]
+    spent = [f"budget={typed.budget}", f"devices={typed.devices}"]
+    return load_resume(stored, [*changes, *spent, f"resume={files.write(str(run))}"])
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:

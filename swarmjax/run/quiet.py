@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError
-from swarmjax.run import compile_cache, execute, memory
+from swarmjax.run import compile_cache, memory
 from swarmjax.run.display import Display, Row
 from swarmjax.run.lifecycle import carry_out, find_run
 from swarmjax.run.loggers import Guarded, Logger
@@ -54,7 +54,6 @@ def train(
     listen: Callable[[Stop], AbstractContextManager[object]],
     *,
     loggers: Sequence[Logger] = (),
-    auto: bool = False,
 ) -> tuple[Path, list[Path]]:
     """Trains a run.
 
@@ -64,7 +63,6 @@ def train(
       listen: makes the context manager for training, for example one that notices signals, as
         `Stop` does.
       loggers: further loggers, which receive the rows too and are closed when the run is written.
-      auto: whether the number of arenas is still to be chosen.
 
     Returns:
       The run directory, and the policy files of its seeds.
@@ -74,9 +72,8 @@ def train(
     """
     if settings.run.dry:
         raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
-    with ExitStack() as told, compile_cache.use(settings.run.compile_cache):
+    with ExitStack() as told, compile_cache.use():
         guarded = [told.enter_context(closing(Guarded(each))) for each in loggers]
-        settings = execute.fill(settings)[0] if auto else settings
         with memory.refusal(settings):
             run, stop = find_run(settings), Stop()
             with listen(stop), _Listener(settings.updates, on_update, stop, guarded) as display:

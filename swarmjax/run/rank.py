@@ -107,7 +107,7 @@ def _died(code: int, *, joined: bool) -> int:
         )
         return REQUEUE
     sys.stderr.write(
-        "swarmjax.train: error: the processes of the run did not connect within a minute: start as "
-        "many as run.processes says, and check run.coordinator, the address of the first.\n"
+        "swarmjax.train: error: the processes of the run did not connect within a minute: start "
+        "all of them, and check JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID.\n"
     )
     return USER_ERROR

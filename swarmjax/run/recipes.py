@@ -30,23 +30,21 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
     chosen = files.parse(cls, [word for word in typed if word.startswith("recipe=")]).get("recipe")
     if not chosen:
         return others
-    path, chain = files.named_path("recipes", chosen, "recipe"), list[Path]()
-    words = others
-    while path is not None:
-        own, base = _read(cls, path)
-        words = [*own, *words]
-        chain.append(path.resolve())
-        if base is not None and base.resolve() in chain:
+    words, chain = others, list[Path]()
+    while chosen:
+        path = files.named_path("recipes", chosen, "recipe")
+        own, chosen = _read(cls, path)
+        if path.resolve() in chain:
             raise ConfigError(
-                f"{path} extends {base}, which extends it in turn: remove the key recipe from one "
-                "of them."
+                f"{path} extends itself: remove the key recipe from one of the files."
             )
-        path = base
+        chain.append(path.resolve())
+        words = [*own, *words]
     return words
 
 
-def _read(cls: type[Section], path: Path) -> tuple[list[str], Path | None]:
-    """Returns the own words of a recipe, and the file of the recipe that it extends."""
+def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
+    """Returns the own words of a recipe, and the choice of the recipe that it extends."""
     found = files.read_yaml(path)
     base = found.pop("recipe", None)
     files.check_shared(cls, found, path)
@@ -54,21 +52,13 @@ def _read(cls: type[Section], path: Path) -> tuple[list[str], Path | None]:
     words = [*_words(choices), *_words(values)]
     try:
         files.parse(cls, words)
-        return words, _base(path, base)
+        if not isinstance(base, str | None):
+            raise ConfigError(
+                f"recipe is {show(base)}: give the name of a recipe, or a file .yaml."
+            )
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-
-
-def _base(path: Path, choice: Any) -> Path | None:
-    """Returns the file that the key `recipe` of a file names; None if it names none."""
-    if choice is None:
-        return None
-    if not isinstance(choice, str):
-        raise ConfigError(f"recipe is {show(choice)}: give the name of a recipe, or a file .yaml.")
-    base = files.named_path("recipes", files.beside(path.parent, choice), "recipe")
-    if not base.is_file():  # also a loop of links
-        raise ConfigError(f"recipe is {show(choice)}, and there is no such file.")
-    return base
+    return words, None if base is None else files.beside(path.parent, base)
 
 
 def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:

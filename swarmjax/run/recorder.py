@@ -84,7 +84,6 @@ class Recorder:
         self,
         run: Path,
         *,
-        update: int,
         episodes: bool = False,
         logs: Mapping[str, int] | None = None,
         loggers: Sequence[Logger] = (),
@@ -93,18 +92,13 @@ class Recorder:
 
         Args:
           run: the run directory.
-          update: updates done at the checkpoint.
           episodes: whether to log episodes.
-          logs: bytes of each log at the checkpoint. Checkpoints of older versions do not record
-            them; rows are then dropped by their update.
+          logs: bytes of each log at the checkpoint; None for a new run.
           loggers: receive the rows too, and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in directory.LOGS:
-            if not logs:
-                directory.cut_rows(run / name, update)
-            else:
-                directory.cut(run / name, logs.get(name, 0))
+            directory.cut(run / name, (logs or {}).get(name, 0))
         names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
         self._logs = {name: Log(run / name) for name in names}
         # A log that this process does not write still belongs to the run.
@@ -139,27 +133,15 @@ class Recorder:
             logger.close()
 
 
-def history(
-    run: Path, update: int, logs: Mapping[str, int] | None = None
-) -> tuple[list[Row], list[Row]]:
+def history(run: Path, logs: Mapping[str, int]) -> tuple[list[Row], list[Row]]:
     """Reads the metrics and decisions that a run logged before a checkpoint.
 
     Args:
       run: the run directory.
-      update: updates done at the checkpoint.
-      logs: bytes of each log at the checkpoint. Without these lengths, rows are selected by their
-        update.
+      logs: bytes of each log at the checkpoint.
 
     Raises:
       CheckpointError: if a log is damaged.
     """
-    if logs:
-        metrics, decisions = (directory.read_rows(run / k, logs.get(k, 0)) for k in _READ)
-        return metrics, decisions
-    metrics, decisions = (directory.read_rows(run / k, None, whole=False) for k in _READ)
-    return _earlier(metrics, update), _earlier(decisions, update)
-
-
-def _earlier(rows: Sequence[Row], update: int) -> list[Row]:
-    """Returns the rows before `update`."""
-    return [row for row in rows if directory.is_before(row, update)]
+    metrics, decisions = (directory.read_rows(run / k, logs.get(k, 0)) for k in _READ)
+    return metrics, decisions

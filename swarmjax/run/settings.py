@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, about
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
@@ -30,19 +30,9 @@ class RunConfig(Section):
     checkpoint_minutes: float = field(
         default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
     )
-    checkpoint_share: float = field(
-        default=0.1,
-        metadata=about("share of the budget between checkpoints; 0: by time only", 0.0, 1.0),
-    )
     keep_checkpoints: int = field(
         default=2,
         metadata=about("how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT),
-    )
-    checkpoint_arenas: bool = field(
-        default=True,
-        metadata=about(
-            "save arenas in checkpoints; false: small files, and a resumed run draws new arenas"
-        ),
     )
     stop_after: int | None = field(
         default=None,
@@ -60,54 +50,17 @@ class RunConfig(Section):
     episodes: bool = field(
         default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")
     )
-    coordinator: Literal["auto"] | str | None = field(
-        default=None,
+    distributed: bool = field(
+        default=False,
         metadata=about(
-            "HOST:PORT of the first of several processes; auto: taken from Slurm, Open MPI or "
-            "Kubernetes; null: a single process"
+            "train with other processes; Slurm, Open MPI or Kubernetes names them, or "
+            "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID"
         ),
-    )
-    processes: int | None = field(
-        default=None, metadata=about("number of processes [coordinator=HOST:PORT]", 1, 2**16)
-    )
-    process: int | None = field(
-        default=None,
-        metadata=about("index of this process, from 0 [coordinator=HOST:PORT]", 0, 2**16),
     )
     deterministic: bool = field(
         default=False, metadata=about("make results on a GPU bit-for-bit repeatable; slower")
     )
     dry: bool = field(default=False, metadata=about("check and describe the run; train nothing"))
-    compile_cache: Literal["auto"] | str | None = field(
-        default="auto",
-        metadata=about("directory for compiled programs; auto: the user's cache; null: none"),
-    )
-    memory_share: float = field(
-        default=0.8,
-        metadata=about("share of the GPU's memory that arenas=auto fills", above=0.0, high=1.0),
-    )
-
-    def _check(self) -> None:
-        given = (self.processes, self.process)
-        if self.coordinator in (None, "auto"):
-            if given != (None, None):
-                where = "null" if self.coordinator is None else "auto"
-                raise ConfigError(
-                    f"processes is {show(self.processes)} and process {show(self.process)}, but "
-                    f"coordinator is {where}: give them only with coordinator=HOST:PORT."
-                )
-            return
-        host, _, port = str(self.coordinator).rpartition(":")
-        if not host or not port.isdecimal() or not 0 < int(port[:9]) < 2**16:
-            raise ConfigError(
-                f"coordinator is {show(self.coordinator)}: give HOST:PORT, auto or null."
-            )
-        if self.processes is None or self.process is None or self.process >= self.processes:
-            raise ConfigError(
-                f"coordinator is {show(self.coordinator)}, but processes is "
-                f"{show(self.processes)} and process {show(self.process)}: give the number of "
-                "processes, and the index of this one, counted from 0."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,10 +100,6 @@ class TrainConfig(ProgramConfig):
         default=None,
         metadata=about("run directory to take the first networks and normaliser from"),
     )
-    init_from_std: Literal["keep", "reset"] = field(
-        default="keep",
-        metadata=about("exploration after init_from; keep: as learned; reset: algo.initial_std"),
-    )
     stage_name: str = field(
         default="",
         metadata=about("name of the stage or of the curriculum", derived=True),
@@ -167,7 +116,7 @@ class TrainConfig(ProgramConfig):
         self._check_devices()
         self._check_budget()
         self._check_counts()
-        self._check_algo()
+        self._check_hearing()
         self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
@@ -236,14 +185,6 @@ class TrainConfig(ProgramConfig):
                 f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
             )
 
-    def _check_algo(self) -> None:
-        self._check_hearing()
-        if self.algo.exploration == "scheduled" and self.budget > MAX_COUNT:
-            raise ConfigError(
-                f"budget is {self.budget}, but algo.exploration=scheduled counts control steps in "
-                f"32 bits: give at most {MAX_COUNT}."
-            )
-
     def _check_hearing(self) -> None:
         """Refuses options that a network with neighbour messages does not support."""
         count = self.task.neighbours.count
@@ -264,11 +205,4 @@ class TrainConfig(ProgramConfig):
             raise ConfigError(
                 f"budget is {self.budget}, but one update takes arenas x algo.rollout_length = "
                 f"{update} control steps: give at least {update}."
-            )
-        most = MAX_COUNT // (self.algo.epochs * self.algo.num_minibatches)
-        if self.updates > most:
-            raise ConfigError(
-                f"budget is {self.budget}, which is {self.updates} updates of {update} control "
-                f"steps, but gradient steps are counted in 32 bits, which is enough for {most} "
-                f"updates: give at most {most * update}."
             )

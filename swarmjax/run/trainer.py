@@ -1,8 +1,5 @@
 """The host's training loop: calls the compiled chunk, records, displays, saves and stops."""
 
-import contextlib
-import importlib
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -42,6 +39,8 @@ CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's
 ALL_SECONDS = 10.0  # longest call with run.chunk=all: a signal waits up to this long
 # Updates in the first call with run.chunk=all. The pace of this call sets the other calls' length.
 FIRST_UPDATES = 32
+# There is a checkpoint at least after this share of the budget, so that a short run has some too.
+BUDGET_SHARE = 0.1
 PATIENCE = 10  # a run has diverged after this many updates in a row without learning
 GROWTH = 4  # a call is at most this many times as long as the previous one
 
@@ -105,7 +104,6 @@ def compile_chunk(
     program: Built,
     schedule: Schedule,
     state: Any,
-    meanwhile: Callable[[], None] | None = None,
 ) -> Compiled:
     """Compiles `seeds.train_chunk` ahead of time.
 
@@ -113,7 +111,6 @@ def compile_chunk(
       program: the run's program.
       schedule: the curriculum's numbers.
       state: [N] a state, or its shapes from `jax.eval_shape`.
-      meanwhile: called in a thread after Python has traced the program, while XLA compiles it.
 
     Returns:
       The program to call.
@@ -123,8 +120,6 @@ def compile_chunk(
     chunk = mesh.jit_chunk(program)
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     lowered = chunk.lower(schedule, part, np.int32(1))
-    if meanwhile is not None:
-        threading.Thread(target=meanwhile, daemon=True).start()
     fixed = program.config.run.deterministic
     call = lowered.compile(loop.compiler_options(deterministic=fixed))
     found = call.memory_analysis()
@@ -136,12 +131,6 @@ def compile_chunk(
         call = partial(_call_at_once, call, groups)
     seconds = time.perf_counter() - began
     return Compiled(call, seconds, groups * found.argument_size_in_bytes, work)
-
-
-def _import_ahead() -> None:
-    """Imports Orbax (half a second) while XLA compiles and Python is idle."""
-    with contextlib.suppress(ImportError):  # the code that needs it reports the error
-        importlib.import_module("orbax.checkpoint")
 
 
 def _call_at_once(
@@ -175,19 +164,12 @@ def prepare(
     Raises:
       ConfigError: if training needs more memory than there is.
     """
-    compiled = compile_chunk(program, schedule, state, _import_ahead)
+    compiled = compile_chunk(program, schedule, state)
     memory.check(program.config, compiled.total_bytes, available)
     seconds = compiled.seconds + _build_kernels(program, state)
     # A call with zero updates changes nothing, but allocates the program's working memory.
     state, _ = jax.block_until_ready(compiled.call(schedule, state, np.int32(0)))
     return replace(compiled, seconds=seconds), state
-
-
-def measure(settings: TrainConfig) -> int:
-    """Compiles a config's program and returns the device memory that training needs, bytes."""
-    program, schedule = programs.load(settings, by_robot=settings.run.episodes)
-    template = jax.eval_shape(mesh.init(program), schedule)
-    return compile_chunk(program, schedule, template).total_bytes
 
 
 def train(
@@ -230,14 +212,13 @@ def train(
         _recorder(run, program, done, kept) as record,
         Checkpoints(run, keep, resumed) as checkpoints,
     ):
-        saves, keeps = Saves(settings, done), settings.run.checkpoint_arenas
+        saves = Saves(settings, done)
         save = partial(
             checkpoints.save,
             rate_scale=1.0 if kept is None else kept.rate_scale,
-            of={"budget": settings.budget, "streams": settings.stream_count, "arenas": keeps},
+            of={"budget": settings.budget, "streams": settings.stream_count},
         )
-        what = partial(_saved_part, arenas=keeps)
-        save(what(state), done, record.sync())  # does nothing if this update is already saved
+        save(state, done, record.sync())  # does nothing if this update is already saved
         for n in _calls(program, tally, stop):
             began = time.perf_counter()
             state, metrics = compiled.call(schedule, state, np.int32(n))
@@ -245,16 +226,11 @@ def train(
             _report(program, tally, metrics, n, time.perf_counter() - began, record, display)
             due = saves.due(tally, checkpoints.write_seconds)
             if tally.is_sound and hosts.share(due)[0]:
-                save(what(state), tally.update, record.sync(), score(settings, tally))
+                save(state, tally.update, record.sync(), score(settings, tally))
             if saves.must_wait(tally):
                 checkpoints.wait()
-        save(what(state), tally.update, record.sync(), score(settings, tally))
+        save(state, tally.update, record.sync(), score(settings, tally))
     return state, tally
-
-
-def _saved_part(state: TrainState, *, arenas: bool) -> Any:
-    """Drops the arenas from the state to save, if the config says so."""
-    return state if arenas else replace(state, arenas=None)
 
 
 class Saves:
@@ -269,7 +245,7 @@ class Saves:
     def __init__(self, settings: TrainConfig, done: int) -> None:
         """Starts to count after `done` updates."""
         self._seconds = 60.0 * settings.run.checkpoint_minutes
-        self._updates = settings.run.checkpoint_share * settings.updates
+        self._updates = BUDGET_SHARE * settings.updates
         self._last = self._before = (time.monotonic(), done)  # the newest and previous checkpoint
         self._update = done
         self._call = 0
@@ -356,7 +332,7 @@ def begin_tally(
     )
     if kept is None:
         return tally
-    rows, decisions = recorder.history(run, done, kept.logs)
+    rows, decisions = recorder.history(run, kept.logs)
     try:
         _add(settings, tally, rows, decisions)
         tally.earlier_s = float(rows[-1]["train_s"]) if rows else 0.0
@@ -385,7 +361,6 @@ def _recorder(run: Path, program: Built, done: int, kept: Kept | None) -> Record
     return Recorder(
         run,
         episodes=settings.run.episodes,
-        update=done,
         logs=None if kept is None else kept.logs,
         loggers=_loggers(run, settings, done),
     )

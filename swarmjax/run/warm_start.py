@@ -1,14 +1,14 @@
 """Implements `init_from=DIR`: a new run starts with another run's networks and normaliser.
 
-Optimiser, learning rate, curriculum, arenas, keys and counters start fresh, with one exception. The
-number of robots that have trained is kept, so that a promotion does not copy one learner over
-another that has already learned.
+Optimiser, learning rate, curriculum, arenas, keys and counters start fresh. There are two
+exceptions: a schedule of exploration goes on, and the number of robots that have trained is kept,
+so that a promotion does not copy one learner over another that has already learned.
 
 If the other run has as many seeds, each seed starts from its counterpart. If the other run has one
 seed, all seeds start from that seed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -17,159 +17,111 @@ import numpy as np
 from swarmjax import extension
 from swarmjax.config import ConfigError, show
 from swarmjax.run import checkpoint
-from swarmjax.run.checkpoint import CheckpointError, Leaves
-from swarmjax.run.load_settings import from_stored, read_config
+from swarmjax.run.checkpoint import CheckpointError, Kept
+from swarmjax.run.load_settings import NETWORK_KEYS, from_stored, read_config
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.config import resolve_encoding
 from swarmjax.training.loop import TrainState
 
-_CARRIED = ("params", "normalizer")  # parts of a learner
-_EXPLORED = "explored"  # another part of a learner whose exploration is scheduled
-# How many robots have trained; a promotion does not overwrite these robots' learners.
-_MET = "curriculum/met"
+_EXPLORED = "learners/explored"  # only where exploration is scheduled
+_MET = "curriculum/met"  # how many robots have trained
+_HEARING = ("count", "message_size")
+_CARRIED = ("learners/params/", "learners/normalizer/", _EXPLORED, _MET)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Source:
-    """The learned state that a new run starts from.
-
-    Attributes:
-      run: directory of the source run.
-      update: update of its checkpoint.
-      leaves: arrays of the learners' networks and normalisers, as `checkpoint.to_leaves` names
-        them, with one entry on the leading axis for each seed of the new run.
-      skipped: a sentence for each newer checkpoint that is damaged.
-    """
-
-    run: Path
-    update: int
-    leaves: Leaves
-    skipped: list[str]
-
-
-def read(settings: TrainConfig) -> Source | None:
+def read(settings: TrainConfig) -> Kept | None:
     """Reads the newest sound checkpoint of the run in `init_from`.
 
     Args:
       settings: the config of the new run.
 
     Returns:
-      The learned state; None without `init_from`.
+      The checkpoint with what is carried over, for each seed of the new run; None without
+      `init_from`.
 
     Raises:
       ConfigError: if there is no such checkpoint, or its networks differ from those of the config.
     """
     if settings.init_from is None:
         return None
-    run, stored = Path(settings.init_from), _read_config(settings.init_from)
-    _check_alike(settings.init_from, stored, settings)
+    run = Path(settings.init_from)
     try:
-        leaves, update, skipped = checkpoint.restore(run)
+        stored = from_stored(read_config(run), "stored ")
+    except ConfigError as error:
+        raise _refused(settings, error) from None
+    _check_alike(settings, stored)
+    try:
+        kept = checkpoint.find(run)
     except CheckpointError as error:
-        raise _refused(settings.init_from, error) from None
-    prefixes = (*(f"learners/{name}/" for name in _CARRIED), f"learners/{_EXPLORED}")
-    times = settings.seeds // stored.seeds
+        raise _refused(settings, error) from None
     carried = {
-        name: np.repeat(leaf, times, axis=0)
-        for name, leaf in leaves.items()
-        if name.startswith(prefixes) or name == _MET
+        name: np.repeat(leaf, settings.seeds // stored.seeds, axis=0)
+        for name, leaf in kept.leaves.items()
+        if name.startswith(_CARRIED)
     }
-    return Source(run=run, update=update, leaves=carried, skipped=skipped)
+    return kept._replace(leaves=carried)
 
 
-def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainState:
+def carry(source: Kept, state: TrainState, settings: TrainConfig) -> TrainState:
     """Puts what was learned into the first state of a new run.
 
     Args:
-      source: the learned state, as `read` gave it.
+      source: what is carried over, as `read` gave it.
       state: the first state, as `seeds.init` gave it.
-      settings: the config of the new run. `init_from_std` selects the exploration to start with.
-
-    Returns:
-      The state with the networks and normalisers of the source. The curriculum in this state
-      records how many robots have trained them.
+      settings: the config of the new run.
 
     Raises:
       ConfigError: if the checkpoint does not match the config in its directory.
     """
-    fresh = {name: getattr(state.learners, name) for name in _CARRIED}
-    if settings.init_from_std == "keep" and f"learners/{_EXPLORED}" in source.leaves:
-        fresh[_EXPLORED] = state.learners.explored
-    template = {"learners": fresh, "curriculum": {"met": state.curriculum.met}}
+    learners, met = state.learners, state.curriculum.met
+    fresh = {"params": learners.params, "normalizer": learners.normalizer}
+    if _EXPLORED in source.leaves:
+        fresh["explored"] = learners.explored
+    template = {"learners": fresh, "curriculum": {"met": met}}
     try:
         found = checkpoint.from_leaves(source.leaves, template)
     except CheckpointError as error:
-        raise _refused(str(source.run), error) from None
-    carried = found["learners"]
-    if settings.init_from_std == "reset":
-        log_std = state.learners.params["actor"]["log_std"]
-        actor = carried["params"]["actor"] | {"log_std": log_std}
-        carried["params"] = carried["params"] | {"actor": actor}
-    met = jnp.maximum(state.curriculum.met, found["curriculum"]["met"])
-    curriculum = replace(state.curriculum, met=met)
-    return replace(state, learners=replace(state.learners, **carried), curriculum=curriculum)
-
-
-def _read_config(init_from: str) -> TrainConfig:
-    try:
-        return from_stored(read_config(Path(init_from)), "stored ")
-    except ConfigError as error:
-        raise _refused(init_from, error) from None
-
-
-def _refused(init_from: str, error: Exception) -> ConfigError:
-    return ConfigError(
-        f"init_from is {show(init_from)}: it takes the directory of a run with a sound checkpoint, "
-        f"but {error}"
+        raise _refused(settings, error) from None
+    met = jnp.maximum(met, found["curriculum"]["met"])
+    return replace(
+        state,
+        learners=replace(learners, **found["learners"]),
+        curriculum=replace(state.curriculum, met=met),
     )
 
 
-def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> None:
+def _refused(settings: TrainConfig, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"init_from is {show(settings.init_from)}: it takes the directory of a run with a sound "
+        f"checkpoint, but {error}"
+    )
+
+
+def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
     """Refuses networks of another shape or number, or with another encoding of observations."""
+    given = show(settings.init_from)
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
-            f"init_from is {show(init_from)}, a run of {stored.seeds} seeds, but seeds is "
-            f"{settings.seeds}: give seeds={stored.seeds}, or a run of one seed."
+            f"init_from is {given}, a run of {stored.seeds} seeds, but seeds is {settings.seeds}: "
+            f"give seeds={stored.seeds}, or a run of one seed."
         )
     pieces, kinds = extension.load(settings.extensions), ["observation", "network"]
-    extension.check_needs(stored.pieces, pieces, init_from, kinds)
-    policy = f"algo.policy={stored.algo.policy}"
-    if stored.algo.policy == "independent":
-        policy += f" sim.max_robots={stored.sim.max_robots}"
-    hidden, activation = show(stored.algo.hidden_sizes), stored.algo.activation
-    output = stored.algo.mean_activation
-    seen, needed = (resolve_encoding(each.task, each.realism) for each in (stored, settings))
-    for name, held, wanted, remedy in (
-        ("number of learners", stored.learners, settings.learners, policy),
-        (
-            "algo.hidden_sizes",
-            hidden,
-            show(settings.algo.hidden_sizes),
-            f"algo.hidden_sizes={hidden}",
-        ),
-        *(
-            (f"algo.{key}", held, wanted, f"algo.{key}={held}")
-            for key in ("memory", "memory_size", "critic")
-            for held, wanted in [
-                tuple(show(getattr(each.algo, key), quote="") for each in (stored, settings))
-            ]
-        ),
-        ("algo.activation", activation, settings.algo.activation, f"algo.activation={activation}"),
-        (
-            "algo.mean_activation",
-            output,
-            settings.algo.mean_activation,
-            f"algo.mean_activation={output}",
-        ),
-        *(
-            (f"task.neighbours.{key}", *values, f"task.neighbours.{key}={values[0]}")
-            for key in ("count", "message_size")
-            for values in [[getattr(x.task.neighbours, key) for x in (stored, settings)]]
-        ),
-        ("encoding of observations", seen, needed, f"task.encoding={seen}"),
-    ):
-        if held != wanted:
+    extension.check_needs(stored.pieces, pieces, settings.init_from or "", kinds)
+    mine, theirs = _networks(settings), _networks(stored)
+    for key, held in theirs.items():
+        if held != mine.get(key, held):
             raise ConfigError(
-                f"init_from is {show(init_from)}, whose {name} is {held}, but here it is {wanted}: "
-                f"give {remedy}, or another run."
+                f"init_from is {given}, whose {key} is {held}, but here it is {mine[key]}: give "
+                f"{key}={held}, or another run."
             )
+
+
+def _networks(settings: TrainConfig) -> dict[str, str]:
+    """Returns the settings that runs with the same networks share, by key."""
+    algo, neighbours = settings.algo, settings.task.neighbours
+    found = {f"algo.{key}": getattr(algo, key) for key in NETWORK_KEYS if key != "network"}
+    if algo.policy == "independent":
+        found["sim.max_robots"] = settings.sim.max_robots
+    found |= {f"task.neighbours.{key}": getattr(neighbours, key) for key in _HEARING}
+    found["task.encoding"] = resolve_encoding(settings.task, settings.realism)
+    return {key: show(value, quote="") for key, value in found.items()}

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 
 import swarmjax
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, show
+from swarmjax.config import show
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.shell.commands import COMMANDS, settings
-
-_TOLD = ("jax", "mujoco", "mujoco-mjx", "python")  # `--version` lists these after swarmjax
 
 
 def main() -> int:
@@ -23,24 +21,14 @@ def main() -> int:
     name, *rest = sys.argv[1:] or ["--help"]
     if name in COMMANDS:
         return _command(name, rest)
-    with command.outputs_kept("swarmjax") as ended:
-        try:
-            return ended(_run(name))
-        except ConfigError as error:
-            sys.stderr.write(f"swarmjax: error: {error}\n")
-            return USER_ERROR
-
-
-def _run(name: str) -> int:
-    if name in command.HELP:
-        sys.stdout.write(help_text() + "\n")
-    elif name == "--version":
-        sys.stdout.write(_versions() + "\n")
-    else:
+    if name not in {*command.HELP, "--version"}:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
-        raise ConfigError(f"{show(name)} is not a command: {hint}")
-    return 0
+        sys.stderr.write(f"swarmjax: error: {show(name)} is not a command: {hint}\n")
+        return USER_ERROR
+    with command.outputs_kept("swarmjax") as ended:
+        sys.stdout.write((_versions() if name == "--version" else help_text()) + "\n")
+        return ended(0)
 
 
 def _command(name: str, rest: Sequence[str]) -> int:
@@ -65,7 +53,9 @@ def help_text() -> str:
 
 
 def _versions() -> str:
-    """Lists the installed versions on one line."""
+    """Lists the versions of swarmjax and of what computes its results, on one line."""
     found = provenance.versions()
-    told = [f"{name} {found[name]}" for name in _TOLD if name in found]
-    return ", ".join([f"swarmjax {swarmjax.__version__}", *told])
+    names = [name for name in ("jax", "mujoco", "mujoco-mjx", "python") if name in found]
+    return ", ".join(
+        [f"swarmjax {swarmjax.__version__}", *(f"{name} {found[name]}" for name in names)]
+    )

@@ -4,7 +4,6 @@ The number of updates is an argument, so one program serves every chunk size. An
 the same run.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,7 +12,6 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum import cohorts
 from swarmjax.curriculum import engine as curricula
 from swarmjax.curriculum.engine import CurriculumState, Schedule
 from swarmjax.ppo import batch as batches
@@ -80,24 +78,6 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
         key=run_key,
         update=jnp.zeros((), jnp.int32),
     )
-
-
-def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
-    """Draws the arenas of a run whose checkpoint has none.
-
-    Args:
-      program: the compiled program.
-      schedule: the curriculum's numbers.
-      state: state without arenas (None).
-
-    Returns:
-      The state with arenas, and with a new cohort of the curriculum.
-    """
-    key, level_key = jax.random.split(state.key)
-    restarted = cohorts.restart(state.curriculum.cohorts)
-    curriculum = replace(state.curriculum, cohorts=restarted)
-    arenas = _draw(program, schedule, curriculum, level_key, waiting=1)
-    return replace(state, arenas=arenas, curriculum=curriculum, key=key)
 
 
 def train_chunk(

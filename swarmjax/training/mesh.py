@@ -99,31 +99,6 @@ def init(program: Program) -> Callable[[Schedule], TrainState]:
     return lambda schedule: spread(schedule, lanes)
 
 
-def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
-    """Draws the arenas of every seed, as `seeds.draw_arenas` does.
-
-    Args:
-      program: the compiled program.
-      schedule: the curriculum's numbers.
-      state: [N] states without arenas (None), spread over devices.
-
-    Returns:
-      [N] states with arenas.
-    """
-    local = partial(seeds.draw_arenas, program)
-    if program.config.devices == 1:
-        return jax.jit(local)(schedule, state)
-    layout = _layout(program.config)
-    spread = jax.shard_map(
-        local,
-        mesh=layout.mesh,
-        in_specs=(_ALL, replace(layout.state, arenas=None)),
-        out_specs=layout.state,
-        check_vma=False,
-    )
-    return jax.jit(spread)(schedule, state)
-
-
 def jit_chunk(program: Program) -> Any:
     """Jits the function that trains every seed for some updates, as `seeds.train_chunk` does.
 

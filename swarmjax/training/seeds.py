@@ -45,20 +45,6 @@ def init(
     return each(program.config, partial(loop.init, program, schedule), lanes)
 
 
-def draw_arenas(program: Program, schedule: Schedule, state: TrainState) -> TrainState:
-    """Draws the arenas of every seed, as `loop.draw_arenas` does.
-
-    Args:
-      program: the compiled program.
-      schedule: the curriculum's numbers.
-      state: [N] states without arenas.
-
-    Returns:
-      [N] states with arenas.
-    """
-    return each(program.config, partial(loop.draw_arenas, program, schedule), state)
-
-
 def train_chunk(
     program: Program, schedule: Schedule, state: TrainState, n: Array
 ) -> tuple[TrainState, Metrics]:

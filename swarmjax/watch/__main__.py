@@ -2,6 +2,12 @@
 
 Prints the page's address, and serves it until Ctrl-C. The page shows whether the run trains, has
 ended or was killed. The page needs no account, and sends nothing off the machine.
+
+Examples:
+  # serve a page on this machine, and print its address
+  python -m swarmjax.watch run=runs/first
+  # on a port of your choice,
+  python -m swarmjax.watch run=runs/first port=8000
 """
 
 import os

@@ -47,7 +47,7 @@ def record(settings: WatchConfig, history: History | None) -> tuple[str, str]:
     run = Path(settings.run)
     trained = settle(replace(rows.read_config(run), extensions=settings.extensions))
     seed, stage = trained.numbers[0], _stage(trained, history)
-    leaves, update, _ = checkpoint.restore(run)
+    leaves, update, *_ = checkpoint.find(run)
     name = f"update-{update}.npz"
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / name

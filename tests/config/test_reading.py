@@ -20,11 +20,12 @@ BOMB = "\n".join(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        (BOMB, "has more than 10000 values"),
-        ("a: &a [*a]", "*a contains itself"),
+        (BOMB, "it has the alias *a0: write the value itself"),
+        ("a: &a [*a]", "it has the alias *a"),
+        ("[" + "1," * 10_001 + "]", "has more than 10000 values"),
         ("a: " + "[" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("[" * 100_000 + "]" * 100_000, "lists or mappings are nested more than 32 deep"),
-        ("a: " + "9" * 4900, "a number has more than 4300 digits"),
+        ("a: " + "9" * 4900, "Exceeds the limit (4300 digits)"),
         ("a: " + "9" * 5001, "more than 5000 characters"),
         ("a: 1\na: 2\n", "key 'a' is there twice"),
         ("{[1]: 2}", "key [1] is not text"),
@@ -47,18 +48,14 @@ def test_yaml_that_stands_for_too_much_is_refused_at_once(
     assert time.monotonic() - began < 5.0
 
 
-def test_aliases_that_stand_for_little_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text("a: &a {x: 1, y: 1e3}\nb: *a\n")
-    read = {"x": 1, "y": 1000.0}
-    assert reading.read_yaml(path) == {"a": read, "b": read}
-
-
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        *((text, text) for text in ("yes", "on", "2020-01-01", "1:30", "1_000", "<<", "${x}")),
-        *(("010", 10), ("0o17", 15), ("0x1f", 31), ("-3", -3), ("+3", 3)),
+        *(
+            (text, text)
+            for text in ("yes", "on", "0x1f", "2020-01-01", "1:30", "1_000", "<<", "${x}")
+        ),
+        *(("010", 10), ("-3", -3), ("+3", 3)),
         *(("1e6", 1e6), (".5", 0.5), ("5.", 5.0), ("-.inf", -math.inf)),
         *(("true", True), ("FALSE", False), ("null", None), ("~", None), ("", None)),
         *(("'null'", "null"), ('"1"', "1")),

@@ -184,7 +184,7 @@ def test_a_step_is_named_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (tmp_path / "config.json").write_text(json.dumps(to_dict(trained)))
     final = tmp_path / "policy.npz"
     before = saved(final)
-    monkeypatch.setattr(export.checkpoint, "restore", lambda run, step: ({}, step, []))
+    monkeypatch.setattr(export.checkpoint, "find", lambda run, step: ({}, step, []))
     monkeypatch.setattr(
         export,
         "write_policy",

@@ -93,29 +93,34 @@ def test_a_schema_refuses_what_is_not_published(name: str, place: list, value: o
         _schema(name).validate(document)
 
 
-def _command(container: dict, index: int) -> list[str]:
+def _command(container: dict) -> list[str]:
     """Substitutes the variables in a container's arguments, as Kubernetes does."""
-    values = {each["name"]: each["value"] for each in container["env"]}
-    values["JOB_COMPLETION_INDEX"] = str(index)
+    values = _variables(container)
     return [
         re.sub(r"\$\((\w+)\)", lambda found: values[found[1]], each) for each in container["args"]
     ]
 
 
+def _variables(container: dict) -> dict[str, str]:
+    return {each["name"]: each["value"] for each in container["env"] if "value" in each}
+
+
 def test_the_pods_of_a_jobset_are_the_processes_of_one_run() -> None:
     job, (train,) = _job(), _pod()["containers"]
-    settings = [load_run(_command(train, index))[0] for index in range(job["completions"])]
-    assert [each.run.process for each in settings] == list(range(job["parallelism"]))
-    (run,) = {(each.run.coordinator, each.run.processes, each.devices) for each in settings}
+    settings, variables = load_run(_command(train)), _variables(train)
+    assert settings.run.distributed
+    assert settings.devices == int(variables["JAX_NUM_PROCESSES"]) == job["completions"]
+    (index,) = (each for each in train["env"] if each["name"] == "JAX_PROCESS_ID")
+    assert index["valueFrom"]["fieldRef"]["fieldPath"].endswith("job-completion-index']")
     name, (replicated,) = (
         _read("jobset")["metadata"]["name"],
         _read("jobset")["spec"]["replicatedJobs"],
     )
     host = f"{name}-{replicated['name']}-0-0.{name}"
-    assert run == (f"{host}:12355", job["completions"], job["completions"])
+    assert variables["JAX_COORDINATOR_ADDRESS"] == f"{host}:12355"
     assert train["resources"]["limits"]["nvidia.com/gpu"] == 1
     assert "command" not in train  # so the image's entry point runs, which is tested below
-    assert _mounted(settings[0], [mount["mountPath"] for mount in train["volumeMounts"]])
+    assert _mounted(settings, [mount["mountPath"] for mount in train["volumeMounts"]])
 
 
 def _mounted(settings: TrainConfig, paths: list[str]) -> bool:
@@ -154,9 +159,9 @@ def test_the_nodes_of_a_cloud_are_the_processes_of_one_run(tmp_path: Path) -> No
     task = _read("skypilot")
     python = tmp_path / ".venv" / "bin" / "python"
     python.parent.mkdir(parents=True)
-    python.write_text('#!/bin/sh\nfor word in "$@"; do echo "$word"; done\n')
+    joined = "$JAX_COORDINATOR_ADDRESS $JAX_NUM_PROCESSES $JAX_PROCESS_ID"
+    python.write_text(f'#!/bin/sh\necho "{joined}"\nfor word in "$@"; do echo "$word"; done\n')
     python.chmod(0o755)
-    settings = []
     for rank in range(task["num_nodes"]):
         given = {
             **task["envs"],
@@ -168,13 +173,12 @@ def test_the_nodes_of_a_cloud_are_the_processes_of_one_run(tmp_path: Path) -> No
         told = subprocess.check_output(
             ["bash", "-c", task["run"]], cwd=tmp_path, env=os.environ | given, text=True
         )
-        module, name, *words = told.splitlines()
+        joined, module, name, *words = told.splitlines()
+        assert joined == f"10.0.0.7:12355 2 {rank}"
         assert (module, name) == ("-m", "swarmjax.train")
-        settings.append(load_run(words)[0])
-    assert [each.run.process for each in settings] == [0, 1]
-    (run,) = {(each.run.coordinator, each.run.processes, each.devices) for each in settings}
-    assert run == ("10.0.0.7:12355", 2, 2)
-    assert _mounted(settings[0], list(task["file_mounts"]))
+        settings = load_run(words)
+        assert (settings.run.distributed, settings.devices) == (True, 2)
+        assert _mounted(settings, list(task["file_mounts"]))
     assert task["resources"]["job_recovery"]["recover_on_exit_codes"] == [75]
     assert task["resources"]["job_recovery"]["max_restarts_on_errors"] == 0
 
@@ -229,7 +233,7 @@ def test_what_an_image_copies_is_what_the_package_is_built_of(tmp_path: Path) ->
         "print(load_settings.__file__)\n"
     )
     told = subprocess.run(
-        [sys.executable, "-c", code, *_command(_pod()["containers"][0], 0)],
+        [sys.executable, "-c", code, *_command(_pod()["containers"][0])],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(tmp_path)},
         capture_output=True,

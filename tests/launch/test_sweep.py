@@ -32,17 +32,6 @@ TINY = [
 GRID = ["grid.arenas=4,8", *TINY]
 
 
-@pytest.fixture(scope="module")
-def sweep() -> Any:
-    spec = importlib.util.spec_from_file_location("sweep", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["sweep"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
 def quick(sweep: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(sweep, "_TICK_S", 0)

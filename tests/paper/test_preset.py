@@ -126,9 +126,6 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
         (["algo.mean_activation=tanh", "algo.activation=relu"],
          "algo.mean_activation is tanh, but activation is relu, and a policy file stores one "
          "activation for all layers: give activation=tanh or mean_activation=linear."),
-        (["algo=paper", "budget=3e9"],
-         "budget is 3000000000, but algo.exploration=scheduled counts control steps in 32 bits: "
-         "give at most 2147483647."),
         (["algo=paper", "budget=5999"],
          "budget is 5999, but one update takes arenas x algo.rollout_length = 6000 control steps: "
          "give at least 6000."),

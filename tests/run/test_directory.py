@@ -195,14 +195,14 @@ def test_a_file_system_without_locks_is_named(
 def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock, path, removed = directory._lock, tmp_path / directory.LOCK, []
+    lock, path, removed = fcntl.flock, tmp_path / directory.LOCK, []
 
-    def remove_first(run: Path, file: Any) -> None:
+    def remove_first(file: Any, how: int) -> None:
         if not removed:  # like a process that held the lock and wrote nothing
             removed.append(path.unlink())
-        lock(run, file)
+        lock(file, how)
 
-    monkeypatch.setattr(directory, "_lock", remove_first)
+    monkeypatch.setattr(fcntl, "flock", remove_first)
     with directory.locked(tmp_path):
         monkeypatch.undo()
         with pytest.raises(ConfigError, match="is writing"), directory.locked(tmp_path):

@@ -20,21 +20,19 @@ WORDS = ["arenas=64", "algo.num_minibatches=4", "run.tensorboard=false"]
 
 
 def _start(run: Path, coordinator: str, process: int, *words: str) -> subprocess.Popen[str]:
-    given = [
-        *WORDS,
-        f"run.dir={run}",
-        f"run.coordinator={coordinator}",
-        "run.processes=2",
-        f"run.process={process}",
-        *words,
-    ]
+    given = [*WORDS, f"run.dir={run}", "run.distributed=true", *words]
+    joined = {
+        "JAX_COORDINATOR_ADDRESS": coordinator,
+        "JAX_NUM_PROCESSES": "2",
+        "JAX_PROCESS_ID": str(process),
+    }
     return subprocess.Popen(
         [sys.executable, "-m", "swarmjax.train", *given],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | joined,
     )
 
 

@@ -28,12 +28,6 @@ def test_resume_may_stop_again():
     assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
 
 
-def test_a_run_from_before_the_choice_of_gradient_goes_on():
-    stored = to_dict(load_train([]))
-    assert stored["algo"].pop("update_backend") == "auto"
-    assert load_resume(stored, []).algo.update_backend == "auto"
-
-
 def test_a_run_of_an_older_version_names_the_last_commit_that_reads_it():
     stored = to_dict(load_train([]))
     stored["task"]["reward"]["time"] = -0.01

@@ -264,7 +264,6 @@ def test_wandb_that_is_missing_is_refused_before_anything_is_written(
         "stage=s1",
         f"run.dir={tmp_path / 'run'}",
         "run.wandb=swarms",
-        "run.compile_cache=null",
     ]
     with pytest.raises(ConfigError, match=r"^run\.wandb is 'swarms', .*install the extra wandb"):
         train.main(words)

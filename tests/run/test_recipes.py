@@ -47,11 +47,6 @@ def test_a_run_holds_the_settings_and_not_the_recipe() -> None:
     assert "recipe" not in to_dict(load_train(["recipe=worlds"]))
 
 
-def test_a_recipe_may_leave_the_number_of_arenas_open(own: Path) -> None:
-    own.write_text("arenas: auto\n")
-    assert load_run([f"recipe={own}"])[1]
-
-
 def test_an_unknown_recipe_is_refused() -> None:
     known = ", ".join(files.choices("recipes"))
     assert refusal(load_train, ["recipe=world"]) == (
@@ -79,29 +74,28 @@ def test_a_recipe_that_extends_itself_is_refused(own: Path, base: str) -> None:
     own.write_text(f"recipe: {base.format(folder=own.parent.name)}\n")
     own.with_name("other.yaml").write_text("recipe: mine.yaml\n")
     said = refusal(load_train, [f"recipe={own}"])
-    end = ".yaml, which extends it in turn: remove the key recipe from one of them."
     assert said.startswith(f"{own.parent}/")
-    assert said.endswith(end)
+    assert said.endswith(" extends itself: remove the key recipe from one of the files.")
 
 
 @pytest.mark.parametrize(
     ("base", "expected"),
     [
         ("world", "recipe is 'world': give one of worlds"),
-        ("[worlds]", "recipe is ['worlds']: give the name of a recipe, or a file .yaml."),
+        ("[worlds]", "{own}: recipe is ['worlds']: give the name of a recipe, or a file .yaml."),
     ],
 )
 def test_a_wrong_base_names_the_file(own: Path, base: str, expected: str) -> None:
     own.write_text(f"recipe: {base}\n")
-    assert refusal(load_train, [f"recipe={own}"]).startswith(f"{own}: {expected}")
+    assert refusal(load_train, [f"recipe={own}"]).startswith(expected.format(own=own))
 
 
 @pytest.mark.parametrize("base", ["missing.yaml", "link.yaml"])
 def test_a_base_that_cannot_be_found_is_refused(own: Path, base: str) -> None:
     own.with_name("link.yaml").symlink_to("link.yaml")
     own.write_text(f"recipe: {base}\n")
-    assert refusal(load_train, [f"recipe={own}"]) == (
-        f"{own}: recipe is '{base}', and there is no such file."
+    assert refusal(load_train, [f"recipe={own}"]).startswith(
+        f"{own.with_name(base)} cannot be read: "
     )
 
 

@@ -70,13 +70,16 @@ def test_seeds_of_an_update_stand_together() -> None:
 
 
 def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
-    with Recorder(tmp_path, update=0) as record:
+    with Recorder(tmp_path) as record:
+        logs = None
         for update in range(4):
+            if update == 3:
+                logs = record.sync()
             record.write([_row(update)], [], {})
         record.write([_row(4)], [{"update": 4, "why": "budget"}], {})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"update": 5, "arena')  # a crash in the middle of a line
-    with Recorder(tmp_path, update=3) as record:
+    with Recorder(tmp_path, logs=logs) as record:
         record.write([_row(3) | {"arena_steps": 33}], [], {})
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["update"] for line in lines] == [0, 1, 2, 3]
@@ -85,7 +88,7 @@ def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> N
 
 
 def test_tensorboard_gets_rows_and_speeds(tmp_path: Path) -> None:
-    with Recorder(tmp_path, update=0, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
         record.write([_row(0) | {"return": 0.5}], [], {"speed": 2.0})
     content = next(tmp_path.glob("tensorboard/*")).read_bytes()
     assert b"return" in content
@@ -105,7 +108,7 @@ def test_a_run_goes_on_where_tensorboard_cannot_be_written(
     # Acts as if TensorBoard were not installed.
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     monkeypatch.setitem(sys.modules, "tensorboardX.event_file_writer", None)
-    with Recorder(tmp_path, update=0, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
         for update in range(2):
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 2
@@ -114,7 +117,7 @@ def test_a_run_goes_on_where_tensorboard_cannot_be_written(
 
 
 def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path) -> None:
-    with Recorder(tmp_path, update=0, loggers=[Boards(tmp_path, [3, 4], [])]) as record:
+    with Recorder(tmp_path, loggers=[Boards(tmp_path, [3, 4], [])]) as record:
         rows = [_row(update, seed) | {f"at{update}": 1.0} for update in range(4) for seed in (3, 4)]
         record.write(rows, [], {"speed": 2.0})
     assert {path.name for path in tmp_path.glob("tensorboard/*")} == {"seed3", "seed4"}
@@ -143,7 +146,7 @@ def test_a_run_ends_though_the_disk_was_full_for_tensorboard(
         write(self, data)
 
     monkeypatch.setattr(RecordWriter, "write", until_full)
-    with Recorder(tmp_path, update=0, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
         for update in range(300):
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 300

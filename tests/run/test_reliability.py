@@ -66,7 +66,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _digest(run: Path) -> str:
-    return digest(checkpoint.restore(run)[0])
+    return digest(checkpoint.find(run)[0])
 
 
 def _updates(run: Path) -> list[int]:
@@ -99,14 +99,6 @@ def _wait_for(path: Path) -> None:
 def test_the_first_checkpoint_comes_before_the_first_update(tmp_path: Path) -> None:
     _stopped(tmp_path / "run", after=1)
     assert checkpoint.steps(tmp_path / "run") == [1, 0]
-
-
-def test_checkpoints_come_by_share_of_the_budget(tmp_path: Path) -> None:
-    words = [*TINY, f"run.dir={tmp_path}", "run.chunk=1", "run.keep_checkpoints=9"]
-    assert train.main([*words, "run.checkpoint_share=0.5", "run.checkpoint_minutes=99"]) == 0
-    steps = checkpoint.steps(tmp_path)
-    assert steps[0] == 9
-    assert 3 <= len(steps) <= 5  # each begins after 2.25 to 4.5 updates
 
 
 def _kill_while_opening(run: Path, torn: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,19 +189,6 @@ def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> No
     assert (run / "episodes.jsonl").read_bytes().startswith(written)
 
 
-@pytest.mark.slow
-def test_a_run_without_arenas_in_its_checkpoints_goes_on_with_others(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, words = tmp_path / "run", [*TINY, "run.checkpoint_arenas=false"]
-    assert train.main([*words, f"run.dir={run}", "run.stop_after=5"]) == 0
-    assert not checkpoint.find(run).has_arenas
-    capsys.readouterr()
-    assert train.main([f"resume={run}"]) == 0
-    assert "holds no arenas" in " ".join(capsys.readouterr().out.split())
-    assert _updates(run) == list(range(9))
-
-
 def test_checkpoints_without_their_config_are_not_added_to(tmp_path: Path) -> None:
     run = _stopped(tmp_path / "run", after=5)
     (run / "config.json").unlink()
@@ -233,7 +212,7 @@ def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
     log = [json.loads(line) for line in (run / "checkpoints.jsonl").read_text().splitlines()]
     assert {row["budget"] for row in log} == {144, 160}
     settings = verify.VerifyConfig(run=str(run), updates=9)
-    found = verify.load_digests(settings, load_run([*TINY, "budget=160"])[0])
+    found = verify.load_digests(settings, load_run([*TINY, "budget=160"]))
     assert set(found) == {row["update"] for row in log if row["budget"] == 160} & set(range(1, 10))
 
 
@@ -262,7 +241,7 @@ def test_a_signal_of_a_scheduler_saves_and_asks_for_a_requeue(
     assert time.monotonic() - began < 60.0
     assert process.returncode == REQUEUE
     assert f"resume={tmp_path}" in said
-    done = checkpoint.restore(tmp_path)[1]
+    done = checkpoint.find(tmp_path)[1]
     assert _updates(tmp_path) == list(range(done))
 
 
@@ -351,7 +330,7 @@ def test_auto_takes_a_larger_budget(tmp_path: Path) -> None:
     words = [*TINY, f"run.dir={tmp_path}", "resume=auto"]
     assert train.main(words) == 0
     assert train.main([*words, "budget=160"]) == 0
-    assert checkpoint.restore(tmp_path)[1] == 10
+    assert checkpoint.find(tmp_path)[1] == 10
 
 
 def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
@@ -450,10 +429,6 @@ def test_a_run_that_was_trained_otherwise_does_not_verify(
             '{"update": 2, "digest": "a", "rate_scale": 0.1}\n',
             "has no digests in checkpoints.jsonl",
         ),
-        (
-            '{"update": 0, "digest": "a", "arenas": false}\n{"update": 2, "digest": "a"}\n',
-            "has no digests in checkpoints.jsonl",
-        ),
         ('{"update": 7, "digest": "a"}\n', "the first checkpoint of .* give at least 7"),
         ("{\n", "checkpoints.jsonl is damaged at line 1"),
     ],
@@ -528,7 +503,7 @@ def test_a_run_that_diverges_again_stops_and_names_the_seed(
     said = capsys.readouterr().err
     assert "no gradient step of seed 1 was finite in 10 updates" in said
     assert "The run had already gone back once: give lower algo.actor_learning_rate" in said
-    assert checkpoint.restore(tmp_path)[1] == 4
+    assert checkpoint.find(tmp_path)[1] == 4
 
 
 @pytest.mark.slow

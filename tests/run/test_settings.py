@@ -135,8 +135,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
          "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, "
-         "levels_per_rollout, realism, extensions, recipe, run, resume, init_from, "
-         "init_from_std."),
+         "levels_per_rollout, realism, extensions, recipe, run, resume, init_from."),
         # Words that are not YAML, or mean something else in other tools.
         (["algo.hidden_sizes=[64"], "algo.hidden_sizes is '[64', which cannot be read: did not "
          "find expected ',' or ']', line 2, column 1."),
@@ -259,12 +258,6 @@ def test_import_needs_neither_jax_nor_hydra():
         (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
          "4096 control steps: give at least 4096."),
-        # 1e15 // 4096 = 244140625000 updates. An update has 1 epoch of 8 minibatches, so 32 bits
-        # are enough for (2**31 - 1) // 8 = 268435455 updates. These take
-        # 268435455 * 4096 = 1099511623680 control steps.
-        (["budget=1e15"], "budget is 1000000000000000, which is 244140625000 updates of 4096 "
-         "control steps, but gradient steps are counted in 32 bits, which is enough for 268435455 "
-         "updates: give at most 1099511623680."),
     ],
 )  # fmt: skip
 def test_train_refuses(words, sentence):
@@ -460,10 +453,7 @@ def test_help_gives_default_meaning_and_allowed_values():
     text = help_text(TrainConfig, "swarmjax.train", ["all"])
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
-    assert (
-        "arenas=128 arenas simulated at once; auto: by run.memory_share "
-        "(a whole number 1 to 1048576)" in lines
-    )
+    assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
         "run.chunk=auto updates per call of the compiled program "
         "(a whole number 1 to 2147483647, all or auto)" in lines

@@ -43,7 +43,7 @@ def evil(tmp_path: Path) -> Path:
         ("init_from", "R"),
         ("run", "{dir: elsewhere}"),
         ("run.dir", "elsewhere"),
-        ("run.coordinator", "'192.0.2.1:80'"),
+        ("run.distributed", "true"),
         ("devices", "2"),
         ("seeds_by", "cores"),
     ],
@@ -114,7 +114,7 @@ def test_a_stage_that_a_file_names_lies_beside_it(tmp_path: Path, kind: str) -> 
     texts = {"recipe": "stage: four.yaml\n", "suite": SUITE.replace("s1", "four.yaml")}
     path.write_text(texts[kind])
     found = KINDS[kind][0](path)
-    stage = found[0].stage[0] if kind == "recipe" else found.cells[0].stage
+    stage = found.stage[0] if kind == "recipe" else found.cells[0].stage
     assert (stage.name, stage.robots) == ("four", 4)
 
 

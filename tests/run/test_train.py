@@ -56,7 +56,7 @@ def _train(*words: str) -> int:
 
 
 def _digest(run: Path) -> str:
-    return digest(checkpoint.restore(run)[0])
+    return digest(checkpoint.find(run)[0])
 
 
 def _rows(run: Path) -> list[dict]:
@@ -132,7 +132,7 @@ def test_chunks_of_any_size_train_the_same_parameters(
 
 def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_path: Path) -> None:
     assert _train(f"run.dir={tmp_path}", "run.stop_after=4") == 0
-    assert checkpoint.restore(tmp_path)[1] == 4
+    assert checkpoint.find(tmp_path)[1] == 4
     assert train.main([f"resume={tmp_path}"]) == 0
     assert _digest(tmp_path) == _digest(whole)
     assert _rows(tmp_path) == _rows(whole)
@@ -225,7 +225,7 @@ def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
     assert [(row["update"], row["seed"]) for row in rows] == [
         (u, k) for u in range(9) for k in (3, 4)
     ]
-    leaves = checkpoint.restore(several)[0]
+    leaves = checkpoint.find(several)[0]
     assert {len(leaf) for leaf in leaves.values()} == {2}
     name = "learners/params/actor/mean/kernel"
     for lane, seed in enumerate((3, 4)):
@@ -394,7 +394,8 @@ def test_foreign_and_missing_runs_are_refused(
     assert "cannot be read" in _refusal(capsys, "export", f"run={tmp_path}")
     stored = to_dict(load_train(TINY))
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    (tmp_path / "checkpoints" / "4").mkdir(parents=True)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "4.npz").write_bytes(b"")
     assert "no sound checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 
@@ -472,5 +473,5 @@ def test_an_interrupt_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     output, _ = process.communicate(timeout=120)
     assert process.returncode == INTERRUPTED
     assert f"resume={tmp_path}" in output
-    assert checkpoint.restore(tmp_path)[1] > 0
+    assert checkpoint.find(tmp_path)[1] > 0
     assert (tmp_path / "policy.npz").exists()

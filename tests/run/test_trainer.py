@@ -41,7 +41,7 @@ def _tally(update: int) -> trainer.Tally:
 def _saves_each_90() -> trainer.Saves:
     """Returns the saves of a run of 900 updates, with one checkpoint every 90 updates."""
     settings = load_train(["stage=s1", "arenas=32", f"budget={900 * 32 * 32}"])
-    run = RunConfig(checkpoint_minutes=99.0, checkpoint_share=0.1)
+    run = RunConfig(checkpoint_minutes=99.0)
     return trainer.Saves(replace(settings, run=run), 0)
 
 

@@ -120,7 +120,3 @@ def test_a_command_ends_as_its_module_does(words: list[str], tmp_path: Path) -> 
         module.stdout,
         module.stderr,
     )
-
-
-def test_every_command_of_the_package_is_in_the_table() -> None:
-    assert {f"swarmjax.{name}" for name in COMMANDS} == command.EXAMPLES.keys()

@@ -122,7 +122,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         )
         state = init(schedule)
         if resume:
-            state = checkpoint.from_leaves(checkpoint.restore(run)[0], state)
+            state = checkpoint.from_leaves(checkpoint.find(run)[0], state)
         mine = replace(program, config=settings)
         with Stop() as stop, Display(6) as display:
             trainer.train(run, mine, schedule, compiled, state, display, stop)

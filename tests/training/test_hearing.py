@@ -19,7 +19,6 @@ WORDS = [
     "task.step_limit=12",
     "task.neighbours.count=2",
     "task.neighbours.message_size=1",
-    "run.checkpoint_share=1",
     "run.tensorboard=false",
 ]
 KINDS = {
@@ -44,7 +43,7 @@ def test_a_resumed_run_is_bit_for_bit_that_of_one_go(kind: str, tmp_path: Path) 
     _run(whole, *KINDS[kind])
     _run(parts, *KINDS[kind], "run.stop_after=3")
     assert train.main([f"resume={parts}"]) == 0
-    assert digest(checkpoint.restore(whole)[0]) == digest(checkpoint.restore(parts)[0])
+    assert digest(checkpoint.find(whole)[0]) == digest(checkpoint.find(parts)[0])
     trained = policy_file.read(whole / "policy.npz")
     assert trained.meta["format"] == policy.FORMAT
     assert trained.neighbours == {"count": 2, "range": 0.7, "message_size": 1}

@@ -67,13 +67,3 @@ def test_seeds_differ(folder: Path) -> None:
 @pytest.mark.slow
 def test_a_checkpoint_holds_all_seeds(folder: Path) -> None:
     assert checkpoint.find(folder / "spread").leaves["update"].tolist() == [9, 9]
-
-
-@pytest.mark.slow
-def test_a_run_goes_on_with_arenas_drawn_over_devices(tmp_path: Path) -> None:
-    run = f"run.dir={tmp_path / 'run'}"
-    _train(*TINY, "seeds_by=devices", "devices=2", run, "run.stop_after=4")
-    config = tmp_path / "run"
-    _train(f"resume={config}", "run.checkpoint_arenas=false", "run.stop_after=6")
-    _train(f"resume={config}")
-    assert checkpoint.find(config).leaves["update"].tolist() == [9, 9]

@@ -279,20 +279,7 @@ def test_a_run_on_another_machine_is_judged_by_what_it_writes(
     assert _state(run)[0] == state
 
 
-def test_a_lock_of_an_older_version_is_of_this_machine(tmp_path: Path) -> None:
-    (tmp_path / ".lock").write_text("process 7")
-    found = directory.writer(tmp_path)
-    assert found is not None
-    assert found.process == 7
-    assert found.is_here
-    assert directory.writer(tmp_path / "none") is None
-
-
-def test_without_a_list_of_locks_a_process_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(path: Path) -> str:
-        raise FileNotFoundError(path)
-
-    monkeypatch.setattr(Path, "read_text", missing)
+def test_a_process_that_has_ended_is_not_writing() -> None:
     assert directory.is_writing(Writer(os.getpid(), ""))
     assert not directory.is_writing(Writer(2**22 + 1, ""))  # above Linux's largest process number
 

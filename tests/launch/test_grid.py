@@ -2,15 +2,15 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from swarmjax.config import ConfigError
-from swarmjax.run import grid
 
 
-def test_a_cell_is_a_combination_of_values(tmp_path: Path) -> None:
-    cells = grid.multiply(tmp_path, ["grid.algo.epochs=1,2", "seeds=5", "grid.arenas=64,128"])
+def test_a_cell_is_a_combination_of_values(sweep: Any, tmp_path: Path) -> None:
+    cells = sweep.multiply(tmp_path, ["grid.algo.epochs=1,2", "seeds=5", "grid.arenas=64,128"])
     assert [cell.label for cell in cells] == [
         "algo.epochs=1 arenas=64",
         "algo.epochs=1 arenas=128",
@@ -53,9 +53,9 @@ _RANGE = ",".join(map(str, range(300)))
     ],
 )
 def test_values_are_a_list_in_yaml(
-    word: str, labels: list[str], folders: list[str], tmp_path: Path
+    sweep: Any, word: str, labels: list[str], folders: list[str], tmp_path: Path
 ) -> None:
-    cells = grid.multiply(tmp_path, [word])
+    cells = sweep.multiply(tmp_path, [word])
     assert [cell.label for cell in cells] == labels
     assert [cell.run.name for cell in cells] == folders
 
@@ -95,9 +95,11 @@ def test_values_are_a_list_in_yaml(
         ),
     ],
 )
-def test_what_is_no_grid_is_refused(words: list[str], sentence: str, tmp_path: Path) -> None:
+def test_what_is_no_grid_is_refused(
+    sweep: Any, words: list[str], sentence: str, tmp_path: Path
+) -> None:
     with pytest.raises(ConfigError) as caught:
-        grid.multiply(tmp_path, words)
+        sweep.multiply(tmp_path, words)
     assert str(caught.value).replace(str(tmp_path), "DIR").startswith(sentence)
 
 
@@ -112,9 +114,9 @@ def test_what_is_no_grid_is_refused(words: list[str], sentence: str, tmp_path: P
     ],
 )
 def test_a_cell_is_done_when_its_budget_is_spent(
-    summary: object, done: bool, tmp_path: Path
+    sweep: Any, summary: object, done: bool, tmp_path: Path
 ) -> None:
-    (cell,) = grid.multiply(tmp_path, ["grid.arenas=64", "stage=s1", "budget=999424"])
+    (cell,) = sweep.multiply(tmp_path, ["grid.arenas=64", "stage=s1", "budget=999424"])
     assert cell.settings.updates == 488
     cell.run.mkdir()
     if summary is not None:

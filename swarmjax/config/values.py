@@ -1,0 +1,165 @@
+"""Converts single values to the type of a setting, and formats values and types for messages."""
+
+import itertools
+import math
+import re
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+_MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
+_MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
+_SHOWN = 80  # letters of a value to show in a message
+# What messages call the types, and examples of lists by the type of their items.
+_NAMES = {
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    bool: "true or false",
+    types.NoneType: "null",
+}
+_LISTS = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
+
+
+class ConfigError(ValueError):
+    """Tells the user in one sentence why a setting is refused."""
+
+
+def options(hint: object) -> tuple[Any, ...]:
+    """Returns the members of a union, or the type itself."""
+    is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
+    return typing.get_args(hint) if is_union else (hint,)
+
+
+def is_range(hint: object) -> bool:
+    """Returns whether a type is a range: two numbers, the lower first."""
+    return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
+
+
+def is_list(hint: object) -> bool:
+    """Returns whether a type is a list of any length."""
+    return typing.get_origin(hint) is tuple and Ellipsis in typing.get_args(hint)
+
+
+def convert_single(hint: object, value: object, key: str) -> object:
+    """Converts a text, number, true, false, null or range.
+
+    Args:
+      hint: the type; it may be a union.
+      value: the data.
+      key: name of the setting in messages.
+
+    Raises:
+      ConfigError: if the data is of no such type.
+    """
+    if isinstance(value, str) and str in options(hint):
+        check_text(key, value)
+    for option in options(hint):
+        try:
+            made = _convert(option, value)
+        except (TypeError, ValueError, OverflowError):
+            continue
+        if isinstance(made, tuple) and made[0] > made[1]:
+            raise ConfigError(f"{key} is {show(value)}: give the lower number first.")
+        return made
+    raise ConfigError(f"{key} is {show(value)}: give {describe(hint)}.")
+
+
+def _convert(hint: object, value: object) -> object:
+    """Converts to one type, or raises an error for `convert_single` to explain."""
+    if typing.get_origin(hint) is Literal:
+        if isinstance(value, str) and value in typing.get_args(hint):
+            return value
+    elif is_range(hint):
+        if isinstance(value, list | tuple) and len(value) == 2:
+            return tuple(_number(typing.get_args(hint)[0], number) for number in value)
+    elif hint is int or hint is float:
+        return _number(hint, value)
+    elif isinstance(hint, type) and isinstance(value, hint) and value != "":
+        return value
+    raise TypeError
+
+
+def _number(kind: type[int] | type[float], value: object) -> int | float:
+    """Converts a number or a numeric string. True and false are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise TypeError
+    try:
+        number: int | float = int(value) if isinstance(value, str) else value
+    except ValueError:
+        number = float(value)
+    if isinstance(number, float) and not math.isfinite(number):
+        raise ValueError
+    if kind is int and number != int(number):
+        raise ValueError
+    return kind(number)
+
+
+def check_text(key: str, text: str) -> None:
+    """Refuses text that cannot be a path or name, before the text is used.
+
+    Args:
+      key: name of the setting in messages.
+      text: a path, a name, or several separated by commas.
+
+    Raises:
+      ConfigError: if the text has a control character, a name too long for a file, or bad Unicode.
+    """
+    if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
+        raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
+    try:
+        names = re.split(b"[/,]", text.encode())
+    except UnicodeEncodeError:
+        raise ConfigError(f"{key} is {show(text)}: give text in UTF-8.") from None
+    longest = max(map(len, names))
+    if longest > _MOST_NAME:
+        raise ConfigError(
+            f"{key} is {show(text)}, with a name of {longest} bytes: give at most {_MOST_NAME}."
+        )
+
+
+def describe(hint: object, bounds: str = "") -> str:
+    """Describes a type in words, with the bounds of its numbers if given."""
+    words = []
+    for option in options(hint):
+        inner = typing.get_args(option)
+        if is_list(option):
+            example = f", as in {_LISTS[inner[0]]}{bounds}" if inner[0] in _LISTS else ""
+            words.append(f"a list{example}")
+        elif typing.get_origin(option) is dict:
+            words.append("values by name")
+        elif typing.get_origin(option) is Literal:
+            words += inner
+        elif is_range(option):
+            whole = "whole " if inner[0] is int else ""
+            words.append(f"a range [low,high] of {whole}numbers{bounds}")
+        else:
+            words.append(_NAMES[option] + (bounds if option in (int, float) else ""))
+    *most, last = words
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def show(value: object, quote: str = "'") -> str:
+    """Formats a value as it would be typed, and shortens it.
+
+    Args:
+      value: plain data.
+      quote: the quotation mark around text.
+    """
+    if isinstance(value, str):
+        text = value[:_SHOWN]
+        text = text if text.isprintable() else text.encode("unicode_escape").decode("ascii")
+        text = f"{quote}{text}{quote}"
+    elif value is None or isinstance(value, bool):
+        text = {None: "null", True: "true", False: "false"}[value]
+    elif isinstance(value, list | tuple):
+        text = f"[{','.join(show(item, quote) for item in value[:_SHOWN])}]"
+    elif isinstance(value, Mapping):
+        items = itertools.islice(value.items(), _SHOWN)
+        text = ", ".join(f"{show(key)}: {show(item)}" for key, item in items).join("{}")
+    elif isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        text = f"a number of {round(value.bit_length() * math.log10(2))} digits"
+    else:
+        text = f"{value:.10g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 3]}..."
