@@ -9,7 +9,7 @@ import functools
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -150,21 +150,27 @@ def train_policy(
     Raises:
       SwarmjaxError: a setting is invalid, or the run broke.
     """
-    from swarmjax.run import quiet
     from swarmjax.run.load_settings import load_run
+    from swarmjax.run.run import Run
     from swarmjax.run.settings import TrainConfig
+    from swarmjax.run.signals import Stop
 
     if isinstance(settings, TrainConfig):
         config, auto = settings, False
     else:
         more = {} if extensions is None else {"extensions": extensions}
         config, auto = load_run(*_given({**_mapping(settings), **more}))
-    run, paths = quiet.train(
-        config, on_update or (lambda row: None), _signals, loggers=_loggers(log), auto=auto
-    )
-    policies = [policy_file.read(file, config.extensions) for file in paths]
-    lines = (run / "metrics.jsonl").read_text().splitlines()
-    return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
+    if config.run.dry:
+        raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
+    stop = Stop()
+    run = Run(config, auto=auto, stop=stop, loggers=_loggers(log), on_update=on_update)
+    # Only the main thread can handle signals.
+    in_main = threading.current_thread() is threading.main_thread()
+    with stop if in_main else nullcontext():
+        run.train()
+    policies = [policy_file.read(file, config.extensions) for file in run.policies]
+    lines = (run.path / "metrics.jsonl").read_text().splitlines()
+    return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run.path)
 
 
 @_one_error
@@ -302,8 +308,3 @@ def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
         else:
             found[f"{where}{key}"] = files.write(value)
     return found
-
-
-def _signals(stop: Any) -> AbstractContextManager[Any]:
-    """Handles Ctrl-C in the main thread; other threads cannot handle it."""
-    return stop if threading.current_thread() is threading.main_thread() else nullcontext()

@@ -50,7 +50,6 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "swarmjax.report": {
         "run=runs/first": "into runs/first/report",
         "run=runs/first out=reports/first": "into a folder of your choice",
-        "run=runs/first send=true": "also send it to the run's TensorBoard or W&B",
         "runs=runs/first,runs/array,'runs/cell*'": "a table of several runs, arrays and sweeps",
     },
     "swarmjax.watch": {

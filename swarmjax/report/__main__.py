@@ -17,42 +17,35 @@ from swarmjax.config import files
 from swarmjax.pages import builder
 from swarmjax.report import page as report_page
 from swarmjax.report import rows, table
-from swarmjax.report import send as report_send
 from swarmjax.report.config import ReportConfig
 from swarmjax.report.table import TableLine
 
 PAGE, TABLE = "report.html", "report.json"
 
 
-def write(
-    run: Path, out: Path, made_by: str, *, send: bool = False, overwrite: bool = False
-) -> list[Path]:
+def write(run: Path, out: Path, made_by: str, *, overwrite: bool = False) -> list[Path]:
     """Writes the report of a run.
 
     Args:
       run: the run directory.
       out: directory of the report; it is created.
       made_by: the command that makes the report, for the page.
-      send: whether the run's loggers also get the figures and the pages in the run directory.
       overwrite: whether files of other origin are replaced.
 
     Returns:
       The files.
 
     Raises:
-      ConfigError: if the run cannot be read, `out` cannot be written, or `send` finds no logger.
+      ConfigError: if the run cannot be read, or `out` cannot be written.
     """
     history = rows.read(run)
-    loggers = report_send.of_run(run, history) if send else []
     # Importing Matplotlib takes a second. Errors above should come without that delay.
     from swarmjax.report import figures as report_figures
 
     figures = report_figures.png_files(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
-    written = builder.write(out, content, overwrite=overwrite)
-    report_send.send(history, [*written, *sorted(run.glob("*.html"))], loggers)
-    return written
+    return builder.write(out, content, overwrite=overwrite)
 
 
 def _write_table(lines: Sequence[TableLine], made_by: str, settings: ReportConfig) -> Path:
@@ -84,7 +77,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"
-    written = write(run, out, made_by, send=settings.send, overwrite=settings.overwrite)
+    written = write(run, out, made_by, overwrite=settings.overwrite)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0

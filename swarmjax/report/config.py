@@ -26,17 +26,8 @@ class ReportConfig(Section):
         metadata=about("directory; null: <run>/report, or with runs only the printed table"),
     )
     overwrite: bool = field(default=False, metadata=OVERWRITE)
-    send: bool = field(
-        default=False,
-        metadata=about(
-            "send the figures, and links to the report and to replays in the run directory, to the "
-            "run's TensorBoard and W&B [run]"
-        ),
-    )
 
     def _check(self) -> None:
         if (self.run is None) == (self.runs is None):
             both = "is missing" if self.run is None else "and runs are given"
             raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... for a table.")
-        if self.send and self.run is None:
-            raise ConfigError("send is true, but runs are given: give run=DIR, or leave it out.")

@@ -18,6 +18,7 @@ from swarmjax.run.settings import TrainConfig
 
 ON_CPU = 128  # the default. More arenas leave fewer updates and gain little speed on a CPU.
 PROBE = 4096  # largest number of arenas in the two small programs. Every accelerator holds them.
+SHARE = 0.8  # of the memory of an accelerator, which `fill` fills
 MARGIN = 0.95  # factor on the proportional estimate: part of the memory does not grow with arenas
 # How XLA, CUDA, and Warp through CUDA, report a failed allocation.
 _EXHAUSTED = ("RESOURCE_EXHAUSTED", "OUT_OF_MEMORY", "Failed to allocate")
@@ -105,8 +106,8 @@ def fill(
     Args:
       settings: the run's config, with any number of arenas.
       measure: returns the memory that training with a config needs, bytes.
-      available: memory of the accelerator, bytes. The share `run.memory_share` of this memory is
-        filled. None on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
+      available: memory of the accelerator, bytes. The share `SHARE` of this memory is filled. None
+        on a CPU, or if the memory is unknown; at most ON_CPU arenas are chosen then.
 
     Returns:
       The config with that number, and a sentence that gives the reason.
@@ -118,9 +119,9 @@ def fill(
         return replace(settings, arenas=arenas), why
     small = [each for each in sizes if each <= PROBE][-2:] or sizes[:1]
     fixed, each_one = line(settings, small, measure)
-    room = settings.run.memory_share * available
+    room = SHARE * available
     arenas = max((n for n in sizes if fixed + each_one * n <= room), default=sizes[0])
-    more = "twice as many would take more than run.memory_share."
+    more = f"twice as many would take more than {100 * SHARE:.0f} %."
     if arenas == sizes[-1]:
         more = f"twice as many are refused: {_reason(settings, 2 * arenas)}"
     return replace(settings, arenas=arenas), (

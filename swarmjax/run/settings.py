@@ -25,8 +25,11 @@ class RunConfig(Section):
     dir: str | None = field(
         default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     )
-    chunk: int | Literal["all", "auto"] = field(
-        default="auto", metadata=about("updates per call of the compiled program", 1, MAX_COUNT)
+    chunk: int | Literal["auto"] = field(
+        default="auto",
+        metadata=about(
+            "updates per call of the compiled program; auto: a second of them", 1, MAX_COUNT
+        ),
     )
     checkpoint_minutes: float = field(
         default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
@@ -54,10 +57,6 @@ class RunConfig(Section):
         default=None,
         metadata=about("Weights & Biases project to log to; needs the extra wandb"),
     )
-    wandb_mode: Literal["offline", "online"] = field(
-        default="offline",
-        metadata=about("offline: write to the run directory for `wandb sync`; online: send to W&B"),
-    )
     episodes: bool = field(
         default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")
     )
@@ -82,10 +81,6 @@ class RunConfig(Section):
     compile_cache: Literal["auto"] | str | None = field(
         default="auto",
         metadata=about("directory for compiled programs; auto: the user's cache; null: none"),
-    )
-    memory_share: float = field(
-        default=0.8,
-        metadata=about("share of the GPU's memory that arenas=auto fills", above=0.0, high=1.0),
     )
 
     def _check(self) -> None:

@@ -48,7 +48,7 @@ class ProgramConfig(Section):
     )
     arenas: int = field(
         default=128,
-        metadata=about("arenas simulated at once; auto: by run.memory_share", 1, 2**20),
+        metadata=about("arenas simulated at once; auto: as many as fit", 1, 2**20),
     )
     devices: int = field(
         default=1,

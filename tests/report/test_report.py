@@ -3,18 +3,15 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from runs import CONFIG, row, write
+from runs import row, write
 
 from swarmjax import command
-from swarmjax.config import ConfigError
 from swarmjax.report import __main__ as report
 from swarmjax.report.config import ReportConfig
 from swarmjax.run import directory
-from swarmjax.run.settings import RunConfig
 
 
 def _run(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -70,7 +67,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             ["run=good", "runs=good"],
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
-        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, overwrite, send."),
+        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, overwrite."),
         (["runs=good,gone"], "runs is 'good,gone', but 'gone' names neither a run nor a "),
         (["runs=g*,none*"], "runs is 'g*,none*', but 'none*' names neither a run nor a "),
         (["runs=good,good"], "runs is 'good,good', which names good twice: give it once."),
@@ -113,22 +110,3 @@ def test_matplotlib_is_loaded_to_draw_only_and_jax_never(tmp_path: Path) -> None
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_figures_and_pages_are_sent_to_the_loggers_of_the_run(tmp_path: Path) -> None:
-    run = write(tmp_path / "run", [row(0), row(1)])
-    (run / "replay.html").write_text("<p>a replay</p>")
-    report.main([f"run={run}", "send=true"])
-    (events,) = (run / "tensorboard").iterdir()
-    content = events.read_bytes()
-    for name in ("report/mix", "report/success", "page/report", "page/replay"):
-        assert name.encode() in content
-    assert (run / "report" / "mix.png").read_bytes() in content
-
-
-def test_figures_of_a_run_without_loggers_are_not_sent(tmp_path: Path) -> None:
-    trained = replace(CONFIG, run=RunConfig(tensorboard=False))
-    run = write(tmp_path / "run", [row(0)], trained=trained)
-    with pytest.raises(ConfigError, match=r"^send is true, but the run has no logger for figures"):
-        report.main([f"run={run}", "send=true"])
-    assert not (run / "report").exists()

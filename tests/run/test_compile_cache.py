@@ -12,7 +12,10 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from swarmjax import train
-from swarmjax.run import compile_cache, execute
+from swarmjax.exit_codes import INTERRUPTED
+from swarmjax.run import compile_cache
+from swarmjax.run.run import Run
+from swarmjax.run.signals import StoppedError
 
 _NAMES = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", *compile_cache._OPTIONS)
 
@@ -80,13 +83,18 @@ def test_what_was_compiled_once_is_read_the_second_time(
 def test_training_keeps_what_it_compiles_where_it_is_told_to(
     unset: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execute, "_run", lambda *_: int(_compile_and_run()))
+    def compile_only(_: Run) -> None:
+        assert int(_compile_and_run()) == 7
+        raise StoppedError
+
+    monkeypatch.setattr(Run, "load", compile_only)
+    here = [f"run.dir={tmp_path / 'run'}"]
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
-    assert train.main([f"run.compile_cache={tmp_path / 'given'}"]) == 7
+    assert train.main([*here, f"run.compile_cache={tmp_path / 'given'}"]) == INTERRUPTED
     assert len(_entries(tmp_path / "given")) == 1
-    assert train.main(["run.compile_cache=null"]) == 7
+    assert train.main([*here, "run.compile_cache=null"]) == INTERRUPTED
     assert not (tmp_path / "user").exists()
-    assert train.main([]) == 7
+    assert train.main(here) == INTERRUPTED
     assert len(_entries(tmp_path / "user" / "swarmjax" / "xla")) == 1
 
 

@@ -11,10 +11,13 @@ import pytest
 
 from swarmjax import train
 from swarmjax.config import ConfigError
+from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.run import execute, lifecycle, memory, trainer
+from swarmjax.run import compiled, memory
+from swarmjax.run import run as runs
 from swarmjax.run.load_settings import load_run, load_train
-from swarmjax.run.settings import RunConfig, TrainConfig
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.signals import StoppedError
 from swarmjax.task.observation import SIZE
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import seeds
@@ -29,8 +32,8 @@ def _linear(fixed: int, each: int) -> Callable[[TrainConfig], int]:
 
 @pytest.mark.slow
 def test_two_small_programs_tell_what_a_larger_one_takes(tiny_config: TrainConfig) -> None:
-    fixed, each = memory.line(tiny_config, [16, 64], trainer.measure)
-    found = trainer.measure(replace(tiny_config, arenas=512, budget=512 * 8))
+    fixed, each = memory.line(tiny_config, [16, 64], compiled.measure)
+    found = compiled.measure(replace(tiny_config, arenas=512, budget=512 * 8))
     # XLA lays out the buffers of each program differently. The measured error is 1.0 %.
     assert fixed + 512 * each == pytest.approx(found, rel=0.02)
     # An arena needs at least the memory of its observations in the batch: 8 control steps of 3
@@ -56,26 +59,25 @@ def test_a_cpu_has_all_the_memory_of_its_computer() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "minibatches", "arenas"),
+    ("available", "minibatches", "arenas"),
     [
         # 0.8 of 100e6 bytes hold 1e6 bytes and 1000 bytes for each of 79,000 arenas, which are
         # rounded down to 8 * 2^13.
-        (0.8, 8, 65536),
-        (0.6, 8, 32768),  # 59,000 fit
-        (0.8, 6, 49152),  # 6 * 2^13
-        (0.01, 8, 8),  # not even the fixed part fits; a later check refuses it
+        (10**8, 8, 65536),
+        (75 * 10**6, 8, 32768),  # 59,000 fit
+        (10**8, 6, 49152),  # 6 * 2^13
+        (10**6, 8, 8),  # not even the fixed part fits; a later check refuses it
     ],
 )
 def test_auto_fills_the_share_with_a_power_of_two(
-    share: float, minibatches: int, arenas: int
+    available: int, minibatches: int, arenas: int
 ) -> None:
     settings = replace(
         SETTINGS,
         arenas=minibatches,
         algo=AlgoConfig(num_minibatches=minibatches),
-        run=RunConfig(memory_share=share),
     )
-    chosen, why = memory.fill(settings, _linear(10**6, 1000), 10**8)
+    chosen, why = memory.fill(settings, _linear(10**6, 1000), available)
     assert chosen == replace(settings, arenas=arenas)
     assert f"{arenas:,}" in why
     assert "1,000 bytes each" in why
@@ -131,10 +133,14 @@ def test_training_begins_with_the_choice(
 ) -> None:
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(memory, "limit", lambda: available)
-    monkeypatch.setattr(execute, "measure", _linear(10**6, 1000))
-    monkeypatch.setattr(execute, "_run", lambda settings, _: settings.arenas)
-    assert train.main([*WORDS, "arenas=auto"]) == arenas
-    assert capsys.readouterr().out.startswith(f"arenas=auto: {arenas:,}, ")
+    monkeypatch.setattr(runs, "measure", _linear(10**6, 1000))
+
+    def stop(_: runs.Run) -> None:
+        raise StoppedError
+
+    monkeypatch.setattr(runs.Run, "load", stop)
+    assert train.main([*WORDS, "arenas=auto", "run.dry=true"]) == INTERRUPTED
+    assert capsys.readouterr().out.splitlines()[1].startswith(f"arenas=auto: {arenas:,}, ")
 
 
 def test_the_command_line_takes_auto() -> None:
@@ -232,8 +238,8 @@ def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "limit", lambda: 2**20)
-    for each in ("_first_state", "prepare", "compile_chunk"):
-        monkeypatch.setattr(lifecycle, each, lambda *_: pytest.fail("nothing to do"))
+    for each in ("_first_state", "compile"):
+        monkeypatch.setattr(runs.Run, each, lambda *_: pytest.fail("nothing to do"))
     with pytest.raises(ConfigError, match=r"^arenas is 1048576, but its state alone needs "):
         train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
     assert not (tmp_path / "run").exists()
@@ -248,10 +254,9 @@ def test_a_program_too_large_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
-    compiled = trainer.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
-    for module in (trainer, lifecycle):
-        monkeypatch.setattr(module, "compile_chunk", lambda *_: compiled)
-    monkeypatch.setattr(lifecycle, "_first_state", lambda *_: (None, []))
+    large = compiled.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
+    monkeypatch.setattr(runs, "compile_chunk", lambda *_: large)
+    monkeypatch.setattr(runs.Run, "_first_state", lambda *_: None)
     monkeypatch.setattr(memory, "limit", lambda: 2 * GIB - 1)
     for words in ([], ["run.dry=true"]):
         with pytest.raises(
