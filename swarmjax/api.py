@@ -137,11 +137,9 @@ def train_policy(
         `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
-      log: a function that is also called with each row, but in its own thread, so the run does not
-        wait for the function. If the function raises, a warning is printed to standard error and
-        the run continues without it. Instead of a function, `log` may be a `Logger` of
-        `swarmjax.run.loggers`, or a list of functions and loggers. A `Logger` also receives speeds,
-        and is closed at the end.
+      log: a `Logger` of `swarmjax.run.loggers`, or a list of them. It is called in its own thread,
+        so the run does not wait for it. If it raises, a warning is printed to standard error and
+        the run continues without it.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -240,17 +238,17 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _loggers(given: Any) -> "list[Logger]":
-    """Converts functions to loggers, and a single logger to a list."""
-    from swarmjax.run.loggers import Calls, Logger
+    """Returns the loggers in `given`, which may be a single one."""
+    from swarmjax.run.loggers import Logger
 
     every = list(given) if isinstance(given, list | tuple) else [given]
-    wrong = [each for each in every if not isinstance(each, Logger) and not callable(each)]
-    if wrong:
-        raise ConfigError(
-            f"log is {show(wrong[0])}: give a function of a row, a Logger of "
-            "swarmjax.run.loggers, or a list of these."
-        )
-    return [each if isinstance(each, Logger) else Calls(each) for each in every]
+    for each in every:
+        if not isinstance(each, Logger):
+            raise ConfigError(
+                f"log is {show(each)}: give a Logger of swarmjax.run.loggers, or a list of "
+                "them; on_update takes a function of a row."
+            )
+    return every
 
 
 def _is_one(policy: Any) -> bool:

@@ -1,11 +1,10 @@
-"""Sends a run's figures to loggers: TensorBoard, W&B and Python functions.
+"""Sends a run's figures to loggers: TensorBoard, W&B and your own.
 
 `metrics.jsonl` is the run's own record. This file is written first, checkpoints record its length,
 and a run that cannot write it ends. A logger holds nothing beyond this record, so its failure does
 not end a run.
 """
 
-import copy
 import queue
 import sys
 import threading
@@ -45,25 +44,6 @@ class Logger(Protocol):
     def close(self) -> None:
         """Closes the logger. No call follows."""
         ...
-
-
-class Calls:
-    """Calls a Python function with each row."""
-
-    name = "log"
-
-    def __init__(self, call: Callable[[Row], object]) -> None:
-        """Stores the function. What the function returns is ignored."""
-        self._call = call
-
-    def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Passes a copy of each row, since the function may keep or change it."""
-        del speeds
-        for row in rows:
-            self._call(copy.deepcopy(row))
-
-    def close(self) -> None:
-        """Does nothing."""
 
 
 class Guarded:

@@ -85,24 +85,12 @@ def diverged(settings: TrainConfig, row: Row, updates: int, *, broke: bool) -> s
 
 
 def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
-    """Describes how good the swarm is on the furthest stage that has been measured.
-
-    Args:
-      settings: the run's config.
-      newest: the last row of each seed.
-    """
+    """Describes how good the swarm is on the last stage, by the last row of each seed."""
     steps = settings.task.step_limit
-    for index, stage in reversed([*enumerate(settings.stage_names)]):
-        shares = [row["success_by_stage"][index] for row in newest]
-        if any(share is not None for share in shares):
-            return (
-                f"targets reached on {stage}: {spread(shares)} within {steps} control steps "
-                f"({steps * settings.task.control_step:.3g} s), in a whole cohort of episodes"
-            )
-    updates = words.count(-(-steps // settings.algo.rollout_length), "update")
     return (
-        f"targets reached: not measured yet, since no whole cohort ended: the episodes of a cohort "
-        f"begin within one step limit ({updates}) and end within the next"
+        f"targets reached on {settings.stage_names[-1]}: "
+        f"{spread([row['success_by_stage'][-1] for row in newest])} within {steps} control steps "
+        f"({steps * settings.task.control_step:.3g} s), in a whole cohort of episodes"
     )
 
 
