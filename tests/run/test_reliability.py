@@ -96,6 +96,11 @@ def _wait_for(path: Path) -> None:
         time.sleep(0.05)
 
 
+def test_a_finished_run_keeps_its_newest_checkpoints(whole: Path) -> None:
+    newest, *older = checkpoint.steps(whole)
+    assert (newest, len(older)) == (9, 1)
+
+
 @pytest.mark.slow
 def test_the_first_checkpoint_comes_before_the_first_update(tmp_path: Path) -> None:
     _stopped(tmp_path / "run", after=1)
