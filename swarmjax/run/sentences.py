@@ -86,12 +86,13 @@ def diverged(settings: TrainConfig, row: Row, updates: int, *, broke: bool) -> s
 
 def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     """Describes how good the swarm is on the last stage, by the last row of each seed."""
+    shares = [row["success_by_stage"][-1] for row in newest]
+    said = f"targets reached on {settings.stage_names[-1]}: {spread(shares)}"
+    if all(share is None for share in shares):
+        return f"{said}: no whole cohort of episodes has ended"
     steps = settings.task.step_limit
-    return (
-        f"targets reached on {settings.stage_names[-1]}: "
-        f"{spread([row['success_by_stage'][-1] for row in newest])} within {steps} control steps "
-        f"({steps * settings.task.control_step:.3g} s), in a whole cohort of episodes"
-    )
+    seconds = steps * settings.task.control_step
+    return f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of episodes"
 
 
 def closing(settings: TrainConfig, run: Path, update: int) -> str:
