@@ -8,8 +8,8 @@ undisturbed run. Disks are mounted in a separate mount namespace (`unshare`, uti
 `libfaketime` sets the clock. If either is missing, the outcome of the trial is `not tried`.
 
 `nan`: a trial trains a small run, puts NaN or an infinity into one array before a random update,
-and continues training. There are three outcomes. `went on`: training continued. `goes back`: the
-optimiser took no more steps, so the run returns to its checkpoint. `WRONG`: an update learned a
+and continues training. There are three outcomes. `went on`: training continued. `stops`: the
+optimiser took no more steps, so the run ends. `WRONG`: an update learned a
 non-finite number, or the fault changed an arena into which no value was put.
 """
 
@@ -32,8 +32,9 @@ import numpy as np
 
 from benchmarks.faults_runs import is_whole, start, train_command, undisturbed
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.run import directory, trainer
+from swarmjax.run import directory
 from swarmjax.run.load_settings import load_train
+from swarmjax.run.run import PATIENCE
 from swarmjax.training import loop, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
@@ -359,12 +360,12 @@ def judge(
     """
     if not alike:
         return "WRONG"
-    # A run returns to its checkpoint after `PATIENCE` updates without learning (`trainer`).
+    # A run ends after `PATIENCE` updates without learning.
     barren = np.isnan(metrics["policy_loss"]) | (metrics["broken_arenas"] >= ARENAS * ROLLOUT)
-    if barren[-trainer.PATIENCE :].all():
+    if barren[-PATIENCE:].all():
         held, kept = spoilt.learners.params, last.learners.params
         same = jax.tree.map(partial(np.array_equal, equal_nan=True), held, kept)
-        return "goes back" if all(jax.tree.leaves(same)) else "WRONG"
+        return "stops" if all(jax.tree.leaves(same)) else "WRONG"
     learned = (last.learners.params, last.learners.normalizer)
     numbers = [leaf for leaf in jax.tree.leaves(learned) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     told = [metrics[name][-LAST:] for name in ("policy_loss", "value_loss", "grad_norm")]

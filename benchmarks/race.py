@@ -48,7 +48,7 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.ppo import optimizer
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
-from swarmjax.run import trainer
+from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import env
@@ -147,7 +147,7 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
     """Trains with swarmjax."""
     program, schedule = programs.load(trained)
     state = jax.jit(mesh.init(program))(schedule)
-    compiled = trainer.compile_chunk(program, schedule, state)
+    compiled = compile_chunk(program, schedule, state)
     judge, updates = load_judge(race, trained), points(race, trained)
     judge(jax.device_get(state.learners))  # compiles, and lets Warp build its kernels
     seconds, shares, transitions = [], [], []

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks import lines
 from swarmjax import command, provenance
 from swarmjax.config import ConfigError, Section, about
-from swarmjax.run import trainer
+from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop, mesh
@@ -153,7 +153,7 @@ class Arm:
     def __init__(self, settings: TrainConfig) -> None:
         program, schedule = programs.load(settings)
         self._state = jax.jit(mesh.init(program))(schedule)
-        compiled = trainer.compile_chunk(program, schedule, self._state)
+        compiled = compile_chunk(program, schedule, self._state)
         self._train = partial(compiled.call, schedule)
         self.compile_s = compiled.seconds
 

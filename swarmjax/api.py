@@ -9,7 +9,7 @@ import functools
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -137,11 +137,9 @@ def train_policy(
         `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
-      log: a function that is also called with each row, but in its own thread, so the run does not
-        wait for the function. If the function raises, a warning is printed to standard error and
-        the run continues without it. Instead of a function, `log` may be a `Logger` of
-        `swarmjax.run.loggers`, or a list of functions and loggers. A `Logger` also receives speeds,
-        and is closed at the end.
+      log: a `Logger` of `swarmjax.run.loggers`, or a list of them. It is called in its own thread,
+        so the run does not wait for it. If it raises, a warning is printed to standard error and
+        the run continues without it.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -150,21 +148,27 @@ def train_policy(
     Raises:
       SwarmjaxError: a setting is invalid, or the run broke.
     """
-    from swarmjax.run import quiet
     from swarmjax.run.load_settings import load_run
+    from swarmjax.run.run import Run
     from swarmjax.run.settings import TrainConfig
+    from swarmjax.run.signals import Stop
 
     if isinstance(settings, TrainConfig):
         config = settings
     else:
         more = {} if extensions is None else {"extensions": extensions}
         config = load_run(*_given({**_mapping(settings), **more}))
-    run, paths = quiet.train(
-        config, on_update or (lambda row: None), _signals, loggers=_loggers(log)
-    )
-    policies = [policy_file.read(file, config.extensions) for file in paths]
-    lines = (run / "metrics.jsonl").read_text().splitlines()
-    return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run)
+    if config.run.dry:
+        raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
+    stop = Stop()
+    run = Run(config, stop=stop, loggers=_loggers(log), on_update=on_update)
+    # Only the main thread can handle signals.
+    in_main = threading.current_thread() is threading.main_thread()
+    with stop if in_main else nullcontext():
+        run.train()
+    policies = [policy_file.read(file, config.extensions) for file in run.policies]
+    lines = (run.path / "metrics.jsonl").read_text().splitlines()
+    return TrainResult(policies[0], policies, [json.loads(line) for line in lines], run.path)
 
 
 @_one_error
@@ -234,17 +238,17 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _loggers(given: Any) -> "list[Logger]":
-    """Converts functions to loggers, and a single logger to a list."""
-    from swarmjax.run.loggers import Calls, Logger
+    """Returns the loggers in `given`, which may be a single one."""
+    from swarmjax.run.loggers import Logger
 
     every = list(given) if isinstance(given, list | tuple) else [given]
-    wrong = [each for each in every if not isinstance(each, Logger) and not callable(each)]
-    if wrong:
-        raise ConfigError(
-            f"log is {show(wrong[0])}: give a function of a row, a Logger of "
-            "swarmjax.run.loggers, or a list of these."
-        )
-    return [each if isinstance(each, Logger) else Calls(each) for each in every]
+    for each in every:
+        if not isinstance(each, Logger):
+            raise ConfigError(
+                f"log is {show(each)}: give a Logger of swarmjax.run.loggers, or a list of "
+                "them; on_update takes a function of a row."
+            )
+    return every
 
 
 def _is_one(policy: Any) -> bool:
@@ -302,8 +306,3 @@ def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
         else:
             found[f"{where}{key}"] = files.write(value)
     return found
-
-
-def _signals(stop: Any) -> AbstractContextManager[Any]:
-    """Handles Ctrl-C in the main thread; other threads cannot handle it."""
-    return stop if threading.current_thread() is threading.main_thread() else nullcontext()

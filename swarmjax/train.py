@@ -23,44 +23,58 @@ Examples:
 
 import sys
 from collections.abc import Sequence
-from functools import partial
 
+from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
 from swarmjax.run import heap, rank
-from swarmjax.run.signals import Stop
+from swarmjax.run.signals import Stop, StoppedError
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command and returns its exit code."""
-    with Stop() as stop:
-        return _train(arguments, stop)
-
-
-def _train(arguments: Sequence[str], stop: Stop) -> int:
-    from swarmjax.run.display import working
-
-    with working("starting"):
+    with Stop(last=__name__ == "__main__") as stop:
         from swarmjax.run.load_settings import load_run
 
         settings = load_run(arguments)
-        if settings.run.distributed and not rank.is_child():
-            return rank.supervise(stop)
-        from swarmjax.run.execute import execute
-    return execute(settings, stop)
+        if rank.needs_parent(settings.run):
+            return rank.supervise()
+        from swarmjax.run.display import Display
+        from swarmjax.run.run import Run
+
+        try:
+            Run(settings, stop=stop, display=Display()).train()
+        except Exception as error:
+            return _failed(error, stop)
+        return stop.code or 0
 
 
-def _command() -> int:
-    """Runs the command on the arguments of the command line."""
-    heap.share()
-    if rank.is_child():
-        rank.begin()
-    with Stop(patient=rank.is_child(), last=True) as stop:
-        from swarmjax import command
-        from swarmjax.run.errors import CheckpointError
-        from swarmjax.run.settings import TrainConfig
+def _failed(error: Exception, stop: Stop) -> int:
+    """Describes the error that ended a run, and returns the exit code.
 
-        train = partial(_train, stop=stop)
-        return command.run("train", train, TrainConfig, (CheckpointError,))
+    Raises:
+      Exception: an error of the user in a run of one process, or a bug.
+    """
+    from swarmjax.config import ConfigError
+    from swarmjax.run import hosts
+    from swarmjax.run.errors import CheckpointError, LostPeerError, TrainingError
+
+    if isinstance(error, StoppedError):
+        sys.stdout.write(f"{error}\n")
+        return stop.code or INTERRUPTED
+    codes = {LostPeerError: REQUEUE, TrainingError: FAILED}
+    if hosts.count() > 1:
+        codes |= {ConfigError: USER_ERROR, CheckpointError: USER_ERROR}
+    if type(error) not in codes:
+        raise error
+    sys.stderr.write(f"swarmjax.train: error: {error}\n")
+    code = codes[type(error)]
+    return code if hosts.count() == 1 else hosts.leave(code)
 
 
 if __name__ == "__main__":
-    sys.exit(_command())
+    from swarmjax import command
+    from swarmjax.run.errors import CheckpointError
+    from swarmjax.run.settings import TrainConfig
+
+    heap.share()
+    rank.follow_parent()
+    sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))

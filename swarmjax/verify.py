@@ -12,7 +12,6 @@ Examples:
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -101,15 +100,17 @@ def replay(trained: TrainConfig, updates: Sequence[int]) -> dict[int, str]:
     import numpy as np
 
     from swarmjax.policy import digest
-    from swarmjax.run import checkpoint, lifecycle, memory, trainer
+    from swarmjax.run import checkpoint
+    from swarmjax.run.run import Run
 
-    program, schedule, state = lifecycle.begin(trained)
-    compiled, state = trainer.prepare(program, schedule, state, memory.limit())
-    call, found, done = partial(compiled.call, schedule), {}, 0
+    run, found, done = Run(trained), {}, 0
+    run.load()
+    run.compile()
+    state = run.state
     for update in updates:
         while done < update:
-            n = min(update - done, program.rows)
-            state, _ = call(state, np.int32(n))
+            n = min(update - done, run.program.rows)
+            state, _ = run.compiled.call(run.schedule, state, np.int32(n))
             done += n
         found[update] = digest(checkpoint.to_leaves(state))
     return found

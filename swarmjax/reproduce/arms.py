@@ -8,9 +8,9 @@ from pathlib import Path
 
 from swarmjax.config import files, to_dict
 from swarmjax.reproduce.config import Arm, ReproduceConfig
-from swarmjax.run import compile_cache, lifecycle, memory
 from swarmjax.run.display import Display
 from swarmjax.run.load_settings import leaves, load_run, load_train
+from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 
@@ -67,9 +67,4 @@ def run(made: TrainConfig, stop: Stop) -> None:
       StoppedError: if a stop was requested before the arm began.
       TrainingError: if a loss is no longer finite.
     """
-    with (
-        compile_cache.use(),
-        memory.refusal(made),
-        Display(made.updates) as display,
-    ):
-        lifecycle.carry_out(made, Path(made.run.dir or ""), stop, display)
+    Run(made, stop=stop, display=Display()).train()

@@ -8,7 +8,6 @@ falls back to the newest sound one. Resuming is exact.
 """
 
 import json
-import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -37,14 +36,12 @@ class Kept(NamedTuple):
       update: updates that were done.
       skipped: a sentence for each newer checkpoint that is damaged.
       logs: bytes of each log at this checkpoint, by name.
-      rate_scale: factor on the learning rates.
     """
 
     leaves: Leaves
     update: int
     skipped: list[str]
     logs: dict[str, int]
-    rate_scale: float
 
 
 def path_of(run: Path, update: int) -> Path:
@@ -70,11 +67,7 @@ def _owner(run: Path) -> dict[str, Any]:
 class Checkpoints:
     """Writes the checkpoints of one run directory, in a `with` block.
 
-    A thread writes them while training continues. The newest checkpoints and the one with the
-    highest score are kept.
-
-    Attributes:
-      write_seconds: time to write the newest checkpoint.
+    A thread writes them while training continues. The newest are kept.
     """
 
     def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
@@ -86,7 +79,6 @@ class Checkpoints:
         self._run, self._keep, self._owner = run, keep, _owner(run)
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
-        self.write_seconds = 0.0
         if update is not None and hosts.is_first():
             for left in (run / FOLDER).glob(".*.tmp.npz"):  # a run was killed while it wrote
                 left.unlink()
@@ -101,8 +93,6 @@ class Checkpoints:
         state: Any,
         update: int,
         logs: Mapping[str, int] | None = None,
-        score: float | None = None,
-        rate_scale: float = 1.0,
         of: Mapping[str, Any] | None = None,
     ) -> None:
         """Begins to write a state.
@@ -113,8 +103,6 @@ class Checkpoints:
           state: the training state; it is copied before this returns.
           update: updates that are done.
           logs: bytes of each log at this update, by name.
-          score: rates the checkpoint, higher is better; None if unknown.
-          rate_scale: factor on the learning rates.
           of: further entries for the checkpoint's row in the list of checkpoints.
 
         Raises:
@@ -124,12 +112,11 @@ class Checkpoints:
         if not hosts.is_first():
             return
         self.wait()
-        meta = {"update": update, "logs": dict(logs or {}), "rate_scale": rate_scale}
-        row = {"score": score, "rate_scale": rate_scale, **(of or {})}
+        meta = {"update": update, "logs": dict(logs or {})}
         # The next call of the program overwrites the state. On a CPU, NumPy may share the state's
         # memory.
         leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
-        self._pending = self._thread.submit(self._write, leaves, meta, row)
+        self._pending = self._thread.submit(self._write, leaves, meta, dict(of or {}))
 
     def wait(self) -> None:
         """Waits until the pending checkpoint is written.
@@ -142,7 +129,7 @@ class Checkpoints:
             pending.result()
 
     def _write(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
-        update, began = meta["update"], time.perf_counter()
+        update = meta["update"]
         try:
             if self._owner and not (self._run / directory.CONFIG).exists():
                 raise OSError(f"{self._run} was removed")  # writing would make it again
@@ -153,7 +140,6 @@ class Checkpoints:
             why = error.strerror or error
             raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
-        self.write_seconds = time.perf_counter() - began
 
     def _write_file(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
         meta |= {"digest": digest(leaves)}
@@ -164,19 +150,9 @@ class Checkpoints:
             log.write([{"update": meta["update"], "digest": meta["digest"], **row}])
 
     def _prune(self) -> None:
-        """Removes all checkpoints except the newest ones and the best."""
-        there = steps(self._run)
-        rows = directory.read_rows(self._run / directory.SAVED, None, whole=False)
-        scores = {
-            row.get("update"): row["score"]
-            for row in rows
-            if isinstance(row.get("score"), int | float)
-        }
-        rated = [step for step in there if step in scores]
-        best = max(rated, key=lambda step: (scores[step], step), default=None)
-        for step in there[self._keep :]:
-            if step != best:
-                path_of(self._run, step).unlink()
+        """Removes all checkpoints except the newest ones."""
+        for step in steps(self._run)[self._keep :]:
+            path_of(self._run, step).unlink()
 
     def __enter__(self) -> "Checkpoints":
         """Returns itself."""
@@ -220,7 +196,7 @@ def find(run: Path, update: int | None = None) -> Kept:
             reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
             skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
         else:
-            return Kept(leaves, step, skipped, meta["logs"], meta["rate_scale"])
+            return Kept(leaves, step, skipped, meta["logs"])
     raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
 
 

@@ -9,9 +9,5 @@ class TrainingError(RuntimeError):
     """Says in one sentence why a run cannot continue."""
 
 
-class DivergedError(RuntimeError):
-    """Says in one sentence that a run has stopped learning."""
-
-
 class LostPeerError(RuntimeError):
     """Says in one sentence that another process of the run is gone."""

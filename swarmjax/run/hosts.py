@@ -18,7 +18,6 @@ import numpy as np
 
 from swarmjax import provenance
 from swarmjax.config import ConfigError, show, to_dict
-from swarmjax.run import rank
 from swarmjax.run.errors import LostPeerError
 from swarmjax.run.load_settings import leaves
 from swarmjax.run.settings import TrainConfig
@@ -64,7 +63,6 @@ def join(settings: TrainConfig) -> None:
             f"{_JOIN_S} s ({reason}): start all of them, and check JAX_COORDINATOR_ADDRESS, "
             "JAX_NUM_PROCESSES and JAX_PROCESS_ID."
         ) from None
-    rank.tell_joined()
     _check_alike(settings)
     _check_devices(settings)
 

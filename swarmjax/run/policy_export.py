@@ -11,7 +11,7 @@ from swarmjax.config import files, to_dict
 from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import checkpoint
-from swarmjax.run.checkpoint import CheckpointError, Leaves
+from swarmjax.run.checkpoint import Leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import observation, pieces
 from swarmjax.task.config import resolve_encoding
@@ -69,60 +69,49 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     described = observation.describe(encoding, chosen.observations, heard)
     names, units = policy_file.action_layout(heard.message_size)
     said = [1.0] * heard.message_size
-    return (
-        _own_network(trained.algo)
-        | _memory(trained.algo)
-        | {
-            "policy": trained.algo.policy,
-            "learners": trained.learners,
-            "activation": trained.algo.activation,
-            "observation": described | {"limit": normalizer.OBSERVATION_LIMIT},
-            "action": {
-                "names": list(names),
-                "units": list(units),
-                "low": [0.0, -robot.max_turn_rate, *(-x for x in said)],
-                "high": [robot.max_speed, robot.max_turn_rate, *said],
-            },
-            "robot": {
-                "preset": files.preset_of("robot", robot),
-                **to_dict(robot),
-            },
-            "sensors": {
-                "preset": files.preset_of("realism", trained.realism),
-                "response": trained.realism.infrared,
-                "range": trained.task.sensor_range,
-                "poses": [list(pose) for pose in epuck.SENSOR_POSES],
-                "height": epuck.SENSOR_HEIGHT,
-                "tilt": epuck.SENSOR_TILT,
-            },
-            "task": {key: getattr(trained.task, key) for key in _TASK}
-            | {"observations": [piece.name for piece in chosen.observations]},
-            "realism": to_dict(trained.realism),
-            "stages": [to_dict(stage) for stage in trained.stage],
-            "extensions": trained.pieces,
-            "config": _shared(trained),
-            "versions": provenance.versions(),
-            "update": update,
-            "seed": seed,
-        }
-    )
+    algo = trained.algo
+    optional: dict[str, Any] = {"network": algo.network} if _has_own_network(algo) else {}
+    if algo.memory != "none":
+        optional["memory"] = {"kind": algo.memory, "size": algo.memory_size}
+    return optional | {
+        "policy": algo.policy,
+        "learners": trained.learners,
+        "activation": algo.activation,
+        "observation": described | {"limit": normalizer.OBSERVATION_LIMIT},
+        "action": {
+            "names": list(names),
+            "units": list(units),
+            "low": [0.0, -robot.max_turn_rate, *(-x for x in said)],
+            "high": [robot.max_speed, robot.max_turn_rate, *said],
+        },
+        "robot": {
+            "preset": files.preset_of("robot", robot),
+            **to_dict(robot),
+        },
+        "sensors": {
+            "preset": files.preset_of("realism", trained.realism),
+            "response": trained.realism.infrared,
+            "range": trained.task.sensor_range,
+            "poses": [list(pose) for pose in epuck.SENSOR_POSES],
+            "height": epuck.SENSOR_HEIGHT,
+            "tilt": epuck.SENSOR_TILT,
+        },
+        "task": {key: getattr(trained.task, key) for key in _TASK}
+        | {"observations": [piece.name for piece in chosen.observations]},
+        "realism": to_dict(trained.realism),
+        "stages": [to_dict(stage) for stage in trained.stage],
+        "extensions": trained.pieces,
+        # Without what concerns only the machine of the run, such as its paths.
+        "config": {k: v for k, v in to_dict(trained).items() if k not in _LOCAL},
+        "versions": provenance.versions(),
+        "update": update,
+        "seed": seed,
+    }
 
 
-def _shared(trained: TrainConfig) -> dict[str, Any]:
-    """Returns the config without what concerns only the machine of the run, such as its paths."""
-    return {key: value for key, value in to_dict(trained).items() if key not in _LOCAL}
-
-
-def _own_network(algo: AlgoConfig) -> dict[str, str]:
-    """Returns the name of the extension's network, if the policy has one."""
-    return {} if algo.network in (None, "mlp") else {"network": algo.network}
-
-
-def _memory(algo: AlgoConfig) -> dict[str, Any]:
-    """Describes the policy's memory, if it has one."""
-    if algo.memory == "none":
-        return {}
-    return {"memory": {"kind": algo.memory, "size": algo.memory_size}}
+def _has_own_network(algo: AlgoConfig) -> bool:
+    """Returns whether the network is an extension's."""
+    return algo.network not in (None, "mlp")
 
 
 def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
@@ -143,7 +132,7 @@ def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.n
     """Writes a tanh output as one more hidden layer, followed by an identity output layer."""
     if algo.mean_activation == "linear":
         return arrays
-    parts, count = ("kernel", "bias"), 0 if _own_network(algo) else len(algo.hidden_sizes)
+    parts, count = ("kernel", "bias"), 0 if _has_own_network(algo) else len(algo.hidden_sizes)
     last = {f"actor/hidden_{count}/{p}": arrays[f"actor/mean/{p}"] for p in parts}
     learners, actions = arrays["actor/mean/bias"].shape
     mean = np.tile(np.eye(actions, dtype=np.float32), (learners, 1, 1))
@@ -166,13 +155,4 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
     """
     lane = seeds.numbers(trained).index(seed)
     arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
-    hidden = sorted(name for name in arrays if re.fullmatch(r"actor/hidden_\d+/bias", name))
-    widths = tuple(arrays[f"actor/hidden_{i}/bias"].shape[1] for i in range(len(hidden)))
-    expected = () if _own_network(trained.algo) else trained.algo.hidden_sizes
-    found = (len(arrays["actor/log_std"]), widths)
-    if found != (trained.learners, expected):
-        raise CheckpointError(
-            f"the checkpoint holds {found[0]} learners of layers {list(widths)}, but the config "
-            f"says {trained.learners} of {list(expected)}: it belongs to another run."
-        )
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

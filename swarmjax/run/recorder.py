@@ -1,5 +1,6 @@
 """Writes a run's metrics, decisions and episodes to JSONL files and loggers while it trains."""
 
+import contextlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,9 +11,9 @@ import numpy as np
 from swarmjax.run import directory
 from swarmjax.run.directory import DECISIONS, EPISODES, METRICS, Log, Row
 from swarmjax.run.loggers import Guarded, Logger
+from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps
-
-_READ = (METRICS, DECISIONS)
+from swarmjax.sim.config import physics_substeps
 
 
 def rows(
@@ -42,10 +43,8 @@ def rows(
         for name, column in metrics.items()
     }
     columns["seed"] = [*seeds] * n
-    found = [
-        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
-    ]
-    return [_row(raw, stages, control_steps) for raw in found]
+    every = zip(*columns.values(), strict=True)
+    return [_row(dict(zip(columns, each, strict=True)), stages, control_steps) for each in every]
 
 
 def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
@@ -77,45 +76,61 @@ def _share(part: float, whole: float) -> float | None:
     return part / whole if whole else None
 
 
+def speeds(settings: TrainConfig, rows: Sequence[Row], seconds: float) -> dict[str, float]:
+    """Returns a call's speeds per second, over all seeds."""
+    rollout = settings.algo.rollout_length
+    arena_steps = len(rows) * settings.arenas * rollout
+    steps = {
+        "arena_steps": arena_steps,
+        "robot_steps": rollout * sum(row["robots"] for row in rows),
+        "physics_steps": arena_steps * physics_substeps(settings.robot, settings.sim.substeps),
+        "transitions": sum(row["transitions"] for row in rows),
+    }
+    return {f"{name}_per_s": count / seconds for name, count in steps.items()}
+
+
 class Recorder:
-    """Appends to the logs of a run directory, in a `with` block."""
+    """Appends to the logs of a run directory and calls the loggers, in a `with` block."""
 
     def __init__(
         self,
         run: Path,
+        logs: Mapping[str, int],
         *,
         episodes: bool = False,
-        logs: Mapping[str, int] | None = None,
         loggers: Sequence[Logger] = (),
     ) -> None:
         """Opens the logs, and drops the rows that a stopped run wrote after its checkpoint.
 
         Args:
           run: the run directory.
+          logs: bytes of each log at the checkpoint; empty for a run without a checkpoint.
           episodes: whether to log episodes.
-          logs: bytes of each log at the checkpoint; None for a new run.
           loggers: receive the rows too, and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in directory.LOGS:
-            directory.cut(run / name, (logs or {}).get(name, 0))
+            directory.cut(run / name, logs.get(name, 0))
+        self._open = contextlib.ExitStack()
         names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
-        self._logs = {name: Log(run / name) for name in names}
+        self._logs = {name: self._open.enter_context(Log(run / name)) for name in names}
         # A log that this process does not write still belongs to the run.
-        self._closed = {k: length for k, length in (logs or {}).items() if k not in names}
-        self._loggers = [Guarded(each) for each in loggers]
+        self._closed = {name: length for name, length in logs.items() if name not in names}
+        self._loggers = [
+            self._open.enter_context(contextlib.closing(Guarded(each))) for each in loggers
+        ]
 
-    def write(self, found: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
+    def write(self, rows: Sequence[Row], decisions: Iterable[Row], speeds: Row) -> None:
         """Writes the rows and decisions of a call. Loggers also receive its speeds."""
-        self._logs[METRICS].write(found)
+        self._logs[METRICS].write(rows)
         self._logs[DECISIONS].write(decisions)
         for logger in self._loggers:
-            logger.write(found, speeds)
+            logger.write(rows, speeds)
 
-    def write_episodes(self, found: Iterable[Row]) -> None:
+    def write_episodes(self, rows: Iterable[Row]) -> None:
         """Writes the episodes of a call, if they are logged."""
         if EPISODES in self._logs:
-            self._logs[EPISODES].write(found)
+            self._logs[EPISODES].write(rows)
 
     def sync(self) -> dict[str, int]:
         """Flushes all rows to disk, and returns the bytes of each log by name."""
@@ -126,22 +141,5 @@ class Recorder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Closes the files."""
-        for log in self._logs.values():
-            log.close()
-        for logger in self._loggers:
-            logger.close()
-
-
-def history(run: Path, logs: Mapping[str, int]) -> tuple[list[Row], list[Row]]:
-    """Reads the metrics and decisions that a run logged before a checkpoint.
-
-    Args:
-      run: the run directory.
-      logs: bytes of each log at the checkpoint.
-
-    Raises:
-      CheckpointError: if a log is damaged.
-    """
-    metrics, decisions = (directory.read_rows(run / k, logs.get(k, 0)) for k in _READ)
-    return metrics, decisions
+        """Closes the files and the loggers."""
+        self._open.close()

@@ -24,8 +24,11 @@ class RunConfig(Section):
     dir: str | None = field(
         default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     )
-    chunk: int | Literal["all", "auto"] = field(
-        default="auto", metadata=about("updates per call of the compiled program", 1, MAX_COUNT)
+    chunk: int | Literal["auto"] = field(
+        default="auto",
+        metadata=about(
+            "updates per call of the compiled program; auto: a second of them", 1, MAX_COUNT
+        ),
     )
     checkpoint_minutes: float = field(
         default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
@@ -42,10 +45,6 @@ class RunConfig(Section):
     wandb: str | None = field(
         default=None,
         metadata=about("Weights & Biases project to log to; needs the extra wandb"),
-    )
-    wandb_mode: Literal["offline", "online"] = field(
-        default="offline",
-        metadata=about("offline: write to the run directory for `wandb sync`; online: send to W&B"),
     )
     episodes: bool = field(
         default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")

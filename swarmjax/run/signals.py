@@ -6,7 +6,6 @@ it. A signal that is ignored when the command starts stays ignored. This module 
 slow, so a command can listen before it loads JAX.
 """
 
-import contextlib
 import math
 import os
 import signal
@@ -24,6 +23,9 @@ CODES = {
     signal.SIGUSR2: REQUEUE,
     signal.SIGHUP: REQUEUE,
 }
+# Seconds in which further signals count as the first one. A scheduler sends a signal to a process
+# and to its parent, which passes it on (`rank`).
+ONE_S = 1.0
 
 
 class StoppedError(Exception):
@@ -35,27 +37,20 @@ class Stop:
 
     Attributes:
       code: the exit code for the first signal; None if there was none.
-      number: the first signal; None if there was none.
       signalled: whether a stop was requested, by a signal or by setting this attribute.
     """
 
-    def __init__(
-        self, until: float = math.inf, *, patient: bool = False, last: bool = False
-    ) -> None:
+    def __init__(self, until: float = math.inf, *, last: bool = False) -> None:
         """Begins without a request to stop.
 
         Args:
           until: time to stop without a signal, on the clock `time.monotonic`.
-          patient: whether to ignore a second signal. A scheduler sends each signal to a process and
-            to its parent. The parent passes the signal on, so the process receives it twice.
           last: whether the process ends after the `with` block. Then everything is saved, and later
             signals must not change the exit code.
         """
         self.signalled = False
-        self._patient, self._last = patient, last
         self.code: int | None = None
-        self.number: int | None = None
-        self._until = until
+        self._until, self._last = until, last
 
     @property
     def asked(self) -> bool:
@@ -65,7 +60,9 @@ class Stop:
     def check(self) -> None:
         """Raises `StoppedError` if a signal came. For use before there is anything to save."""
         if self.signalled:
-            raise StoppedError
+            raise StoppedError(
+                "stopped before the first update: nothing was trained, and nothing is lost"
+            )
 
     def __enter__(self) -> "Stop":
         """Begins to listen."""
@@ -75,9 +72,7 @@ class Stop:
         heard = [each for each in CODES if signal.getsignal(each) is not signal.SIG_IGN]
         self._before = {number: signal.signal(number, self._ask) for number in heard}
         self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._thread = threading.Thread(
-            target=_watch, args=(self._read, self._patient), daemon=True
-        )
+        self._thread = threading.Thread(target=_watch, args=(self._read,), daemon=True)
         self._thread.start()
         return self
 
@@ -90,38 +85,32 @@ class Stop:
         self._thread.join()
 
     def _ask(self, number: int, _: FrameType | None) -> None:
-        if self.code is None:
-            self.code, self.number = CODES[signal.Signals(number)], number
+        self.code = self.code or CODES[signal.Signals(number)]
         self.signalled = True
 
 
-def _watch(read: int, patient: bool) -> None:
+def _watch(read: int) -> None:
     """Reports the first signal, and ends the process at the second.
 
     Python calls a handler only between its own instructions. A compiled program can run for minutes
     within one instruction. The bytes of `signal.set_wakeup_fd` arrive at once.
     """
-    first: signal.Signals | None = None
+    code, since = None, 0.0
     with os.fdopen(read, "rb", buffering=0) as pipe:
         while number := pipe.read(1):
-            found = signal.Signals(number[0])
-            if found not in CODES:
+            if number[0] not in CODES:
                 continue
-            if first is not None and patient:
-                continue
-            if first is not None:
-                _end(CODES[first])
-            first = found
-            _say("stopping after the current call, to save; a second signal stops at once")
-
-
-def _end(code: int) -> None:
-    """Ends the process without waiting. Files that it was writing keep their old content."""
-    _say("stopped at once; what was saved before is kept")
-    os._exit(code)
+            if code is None:
+                code, since = CODES[signal.Signals(number[0])], time.monotonic()
+                _say("stopping after the current call, to save; a second signal stops at once")
+            elif time.monotonic() > since + ONE_S:
+                _say("stopped at once; what was saved before is kept")
+                os._exit(code)
 
 
 def _say(sentence: str) -> None:
-    with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+    try:
         sys.stderr.write(f"{sentence}\n")
         sys.stderr.flush()
+    except (OSError, ValueError):  # the terminal may be gone
+        pass

@@ -1,7 +1,5 @@
 """Writes TensorBoard events with tensorboardX, into one folder for each seed of a run."""
 
-import contextlib
-import struct
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -33,12 +31,11 @@ class Boards:
           stages: names of the stages of its curriculum.
           purge: arena step from which on TensorBoard hides older events; None: it hides none.
         """
-        self._stages = stages
         folder = run / FOLDER
         several = len(seeds) > 1
         self._folders = {k: folder / f"seed{k}" if several else folder for k in seeds[:BOARDS]}
-        self._purge = purge
-        self._open: dict[int, Board] = {}
+        self._stages, self._purge = stages, purge
+        self._writers: dict[int, Any] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
         """Writes rows, and the speeds to the first folder.
@@ -47,104 +44,56 @@ class Boards:
         each folder receives only every N-th update. All folders together then take no more time
         than one.
         """
-        boards = self._boards()
+        if not self._writers:
+            self._open()
         for row in rows:
-            if row["seed"] in boards and row["update"] % len(boards) == 0:
-                boards[row["seed"]].add(numbers(row, self._stages), row["arena_steps"])
-        next(iter(boards.values())).add(numbers(speeds), rows[-1]["arena_steps"])
-
-    def attach(self, name: str, path: Path, arena_steps: int) -> None:
-        """Writes a PNG as an image, or the path of any other file, to the first folder."""
-        board = next(iter(self._boards().values()))
-        if path.suffix == ".png":
-            board.add_picture(name, path.read_bytes(), arena_steps)
-        else:
-            board.add_text(name, f"`{path.resolve()}`", arena_steps)
+            if row["seed"] in self._writers and row["update"] % len(self._writers) == 0:
+                self._add(row["seed"], numbers(row, self._stages), row["arena_steps"])
+        self._add(next(iter(self._writers)), numbers(speeds), rows[-1]["arena_steps"])
 
     def close(self) -> None:
         """Writes the remaining events."""
-        for board in self._open.values():
-            with contextlib.suppress(OSError):  # already reported when the logger was lost
-                board.close()
+        for writer in self._writers.values():
+            writer.close()
 
-    def _boards(self) -> "dict[int, Board]":
-        if not self._open:
-            self._open = {seed: Board(path, self._purge) for seed, path in self._folders.items()}
-        return self._open
+    def _open(self) -> None:
+        """Makes the folders and their files.
 
-
-class Board:
-    """One TensorBoard folder.
-
-    The `SummaryWriter` of tensorboardX has a thread that dies on a full disk. The thread's queue
-    then stays full, and the next write waits forever. The `EventsWriter` of tensorboardX has no
-    thread.
-    """
-
-    def __init__(self, folder: Path, purge: int | None) -> None:
-        """Makes the folder and its file. TensorBoard hides older events from step `purge` on."""
+        The `SummaryWriter` of tensorboardX takes an event for each number. Its `EventsWriter` takes
+        one for a row.
+        """
         from tensorboardX.event_file_writer import EventsWriter
 
-        folder.mkdir(parents=True, exist_ok=True)
-        self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
-        if purge is not None:
-            event = _event(purge)
-            event.session_log.status = event.session_log.START
-            self._writer.write_event(event)
+        for seed, folder in self._folders.items():
+            folder.mkdir(parents=True, exist_ok=True)
+            self._writers[seed] = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
+            if self._purge is not None:
+                event = _event(self._purge)
+                event.session_log.status = event.session_log.START
+                self._writers[seed].write_event(event)
 
-    def add(self, values: Mapping[str, float], arena_steps: int) -> None:
-        """Writes numbers by name."""
+    def _add(self, seed: int, values: Mapping[str, float], arena_steps: int) -> None:
         event = _event(arena_steps)
         for name, value in values.items():
             event.summary.value.add(tag=name, simple_value=value)
-        self._writer.write_event(event)
-
-    def add_picture(self, name: str, png: bytes, arena_steps: int) -> None:
-        """Writes a PNG. The first chunk of a PNG holds its size (PNG specification, 11.2.1)."""
-        event = _event(arena_steps)
-        image = event.summary.value.add(tag=name).image
-        image.width, image.height = struct.unpack(">II", png[16:24])
-        image.colorspace, image.encoded_image_string = 4, png  # red, green, blue, alpha
-        self._writer.write_event(event)
-
-    def add_text(self, name: str, text: str, arena_steps: int) -> None:
-        """Writes Markdown for TensorBoard's text page."""
-        from tensorboardX.proto import types_pb2
-
-        event = _event(arena_steps)
-        value = event.summary.value.add(tag=name)
-        value.metadata.plugin_data.plugin_name = "text"
-        types: Any = types_pb2
-        value.tensor.dtype = types.DT_STRING
-        value.tensor.string_val.append(text.encode())
-        self._writer.write_event(event)
-
-    def close(self) -> None:
-        """Writes the remaining events."""
-        self._writer.close()
+        self._writers[seed].write_event(event)
 
 
 def numbers(row: Row, stages: Sequence[str] = ()) -> dict[str, float]:
-    """Lists the numbers of a row by name.
-
-    A list has a number for each stage of the curriculum. This number gets the name of the list, a
-    slash and the name of the stage. Entries without a number are left out.
+    """Lists the numbers of a row by name; leaves out what is no number.
 
     Args:
-      row: row of `metrics.jsonl`.
+      row: row of `metrics.jsonl`. A list in it has a number for each stage. The number gets the
+        name of the list, a slash and the name of the stage.
       stages: names of the stages.
-
-    Returns:
-      The numbers.
     """
-    found = {}
+    flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, list):
-            parts = {f"{name}/{stage}": x for stage, x in zip(stages, value, strict=True)}
+            flat |= {f"{name}/{stage}": x for stage, x in zip(stages, value, strict=True)}
         else:
-            parts = {name: value}
-        found |= {key: part for key, part in parts.items() if isinstance(part, int | float)}
-    return found
+            flat[name] = value
+    return {name: value for name, value in flat.items() if isinstance(value, int | float)}
 
 
 def _event(arena_steps: int) -> Any:

@@ -15,9 +15,9 @@ import pytest
 
 from benchmarks import steps_per_second, timing
 from benchmarks.steps_per_second import Prepared
-from swarmjax.run import trainer
+from swarmjax.run.compiled import Compiled
+from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.signals import Stop
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
@@ -54,7 +54,7 @@ def program(tiny_config: TrainConfig, tiny_world: World) -> Program:
         tiny_config,
         seeds=SEEDS,
         sim=replace(tiny_config.sim, substeps=SUBSTEPS),
-        run=replace(tiny_config.run, chunk="all", tensorboard=False),
+        run=replace(tiny_config.run, chunk=2, tensorboard=False),
         budget=ARENAS * ROLLOUT * 2,  # two updates of each seed
     )
     return programs.build(config, tiny_world)
@@ -194,12 +194,14 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
         return _State(state.update + n), metrics
 
     shown: list[Line] = []
-    display: Any = SimpleNamespace(
-        show=lambda _, speeds, __: shown.append(speeds), say=print, hear=lambda *_: None
+    logger: Any = SimpleNamespace(
+        name="shown", write=lambda _, speeds: shown.append(speeds), close=lambda: None
     )
-    compiled: Any = trainer.Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
-    begun: Any = _State(jnp.zeros(SEEDS, jnp.int32))
-    trainer.train(tmp_path / "run", program, schedule, compiled, begun, display, Stop())
+    run = Run(program.config, loggers=[logger])
+    run.path, run.program, run.schedule = tmp_path / "run", program, schedule
+    run.compiled = Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
+    run.state = _State(jnp.zeros(SEEDS, jnp.int32))
+    run._train_chunks()
     (speeds,) = shown
     assert speeds["arena_steps_per_s"] == 2 * SEEDS * ARENAS * ROLLOUT / MEDIAN
     assert speeds["robot_steps_per_s"] == 2 * SEEDS * 20 * ROLLOUT / MEDIAN

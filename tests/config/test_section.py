@@ -32,7 +32,7 @@ STAGE = {"name": "s", "robots": 2, "side": 1.0}
     ("load", "words"),
     [
         (load_train, []),
-        (load_train, ["stage=s3", "algo.hidden_sizes=[8,16,32]", "run.chunk=all", "run.dir=a b"]),
+        (load_train, ["stage=s3", "algo.hidden_sizes=[8,16,32]", "run.chunk=9", "run.dir=a b"]),
         (load_train, ["stage.sequence=[s2,s1]", "sim.iterations=4", "run.chunk=7"]),
         (partial(load_levels, EvaluateConfig), ["policy=p", "stage=expanded", "workers=2"]),
         (partial(files.load, ExportConfig), ["run=r", "step=3"]),
@@ -132,7 +132,7 @@ def test_null_only_where_it_is_allowed():
     )
 
 
-@pytest.mark.parametrize(("value", "made"), [("all", "all"), ("auto", "auto"), (3.0, 3), ("4", 4)])
+@pytest.mark.parametrize(("value", "made"), [("auto", "auto"), (3.0, 3), ("4", 4)])
 def test_chunk_takes_a_number_or_a_word(value, made):
     assert build(RunConfig, {"chunk": value}).chunk == made
 

@@ -170,20 +170,11 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_best_is_kept_besides_the_newest(tmp_path: Path) -> None:
-    with Checkpoints(tmp_path, keep=1) as checkpoints:
-        for update, score in ((1, 0.5), (2, 0.9), (3, 0.7), (4, None)):
-            checkpoints.save(_state(1.0), update, score=score)
-    assert checkpoint.steps(tmp_path) == [4, 2]
-
-
-@pytest.mark.slow
 def test_the_bytes_of_the_logs_come_back(tmp_path: Path) -> None:
     with Checkpoints(tmp_path, keep=1) as checkpoints:
-        checkpoints.save(_state(1.0), 1, {"metrics.jsonl": 17}, rate_scale=0.1)
+        checkpoints.save(_state(1.0), 1, {"metrics.jsonl": 17})
     kept = checkpoint.find(tmp_path)
     assert kept.logs == {"metrics.jsonl": 17}
-    assert kept.rate_scale == 0.1
 
 
 def test_a_state_is_copied_before_the_run_goes_on(tmp_path: Path) -> None:

@@ -10,7 +10,10 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from swarmjax import train
-from swarmjax.run import compile_cache, execute
+from swarmjax.exit_codes import INTERRUPTED
+from swarmjax.run import compile_cache
+from swarmjax.run.run import Run
+from swarmjax.run.signals import StoppedError
 
 _NAMES = (
     "jax_compilation_cache_dir",
@@ -76,8 +79,12 @@ def test_what_was_compiled_once_is_read_the_second_time(own: Path, events: list[
 
 
 def test_training_keeps_what_it_compiles(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(execute, "_run", lambda *_: int(_compile_and_run()))
-    assert train.main([]) == 7
+    def compile_only(_: Run) -> None:
+        assert int(_compile_and_run()) == 7
+        raise StoppedError
+
+    monkeypatch.setattr(Run, "load", compile_only)
+    assert train.main([f"run.dir={own / 'run'}"]) == INTERRUPTED
     assert len(_entries(own)) == 1
 
 

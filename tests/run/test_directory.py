@@ -15,15 +15,16 @@ from typing import Any
 import pytest
 
 from swarmjax.config import ConfigError
-from swarmjax.run import directory, lifecycle
+from swarmjax.run import directory
 from swarmjax.run.directory import Log
 from swarmjax.run.errors import CheckpointError
 from swarmjax.run.load_settings import load_train
+from swarmjax.run.run import check_free
 
 # A program that holds the lock of a directory until it is killed.
 _HOLDER = """
 import pathlib, sys, time
-from swarmjax.run import directory, lifecycle
+from swarmjax.run import directory
 with directory.locked(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
@@ -213,4 +214,4 @@ def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(
 def test_a_pipe_in_a_run_directory_is_refused(name: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / name)
     with pytest.raises(ConfigError, match=f"{name} is neither a file nor a folder: remove it"):
-        lifecycle.find_run(load_train(["stage=s1", f"run.dir={tmp_path}"]))
+        check_free(tmp_path, load_train(["stage=s1"]))

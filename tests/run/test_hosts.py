@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from swarmjax.run import hosts, rank
+from swarmjax.run import hosts
 from swarmjax.run.load_settings import load_train
 
 ROOT = Path(__file__).parents[2]
@@ -67,22 +66,6 @@ def test_devices_are_those_of_all_processes(tmp_path: Path, coordinator: str) ->
     for code, said in map(_said, both):
         assert code == 2
         assert "devices is 1, but the 2 processes of the run have 2: give devices=2." in said
-
-
-def test_lines_of_an_abort_are_left_out() -> None:
-    said = [
-        "F1124 02:00:00.000000 12 client.h:80] Terminating process\n",
-        "*** Check failure stack trace: ***\n",
-        "    @     0x7f2d5a6a666d  main\n",
-        "swarmjax.train: error: a sentence\n",
-    ]
-    assert list(rank._sentences(said)) == said[-1:]
-
-
-@pytest.mark.parametrize(("joined", "code"), [(False, 2), (True, 75)])
-def test_a_death_is_a_sentence(joined: bool, code: int, capsys: pytest.CaptureFixture) -> None:
-    assert rank._died(-signal.SIGABRT, joined=joined) == code
-    assert capsys.readouterr().err.startswith("swarmjax.train: error: ")
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ import pytest
 
 from swarmjax import train
 from swarmjax.config import ConfigError
-from swarmjax.run import lifecycle, memory, trainer
+from swarmjax.run import compiled, memory
+from swarmjax.run import run as runs
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import seeds
@@ -111,8 +112,8 @@ def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(memory, "limit", lambda: 2**20)
-    for each in ("_first_state", "prepare", "compile_chunk"):
-        monkeypatch.setattr(lifecycle, each, lambda *_: pytest.fail("nothing to do"))
+    for each in ("_first_state", "compile"):
+        monkeypatch.setattr(runs.Run, each, lambda *_: pytest.fail("nothing to do"))
     with pytest.raises(ConfigError, match=r"^arenas is 1048576, but its state alone needs "):
         train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
     assert not (tmp_path / "run").exists()
@@ -127,10 +128,9 @@ def test_a_program_too_large_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
-    compiled = trainer.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
-    for module in (trainer, lifecycle):
-        monkeypatch.setattr(module, "compile_chunk", lambda *_: compiled)
-    monkeypatch.setattr(lifecycle, "_first_state", lambda *_: (None, []))
+    large = compiled.Compiled(lambda *_: pytest.fail("never called"), 1.0, GIB, GIB)
+    monkeypatch.setattr(runs, "compile_chunk", lambda *_: large)
+    monkeypatch.setattr(runs.Run, "_first_state", lambda *_: None)
     monkeypatch.setattr(memory, "limit", lambda: 2 * GIB - 1)
     for words in ([], ["run.dry=true"]):
         with pytest.raises(

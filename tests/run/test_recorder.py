@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from tensorboardX.record_writer import RecordWriter
 
-from swarmjax.run import recorder, trainer
+from swarmjax.run import recorder
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.recorder import Recorder
+from swarmjax.run.run import Run
 from swarmjax.run.tensorboard import Boards
 
 ONE_SEED = {
@@ -70,16 +71,14 @@ def test_seeds_of_an_update_stand_together() -> None:
 
 
 def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> None:
-    with Recorder(tmp_path) as record:
-        logs = None
-        for update in range(4):
-            if update == 3:
-                logs = record.sync()
+    with Recorder(tmp_path, {}) as record:
+        for update in range(3):
             record.write([_row(update)], [], {})
-        record.write([_row(4)], [{"update": 4, "why": "budget"}], {})
+        logs = record.sync()
+        record.write([_row(3)], [{"update": 3, "why": "budget"}], {})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"update": 5, "arena')  # a crash in the middle of a line
-    with Recorder(tmp_path, logs=logs) as record:
+    with Recorder(tmp_path, logs) as record:
         record.write([_row(3) | {"arena_steps": 33}], [], {})
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["update"] for line in lines] == [0, 1, 2, 3]
@@ -88,7 +87,7 @@ def test_a_resumed_run_drops_what_came_after_its_checkpoint(tmp_path: Path) -> N
 
 
 def test_tensorboard_gets_rows_and_speeds(tmp_path: Path) -> None:
-    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, {}, loggers=[Boards(tmp_path, [0], [])]) as record:
         record.write([_row(0) | {"return": 0.5}], [], {"speed": 2.0})
     content = next(tmp_path.glob("tensorboard/*")).read_bytes()
     assert b"return" in content
@@ -96,9 +95,9 @@ def test_tensorboard_gets_rows_and_speeds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_a_run_writes_tensorboard_where_it_is_wanted(tmp_path: Path, wanted: bool) -> None:
+def test_a_run_writes_tensorboard_where_it_is_wanted(wanted: bool) -> None:
     settings = load_train(["stage=s1", f"run.tensorboard={str(wanted).lower()}"])
-    found = [logger.name for logger in trainer._loggers(tmp_path, settings, 0)]
+    found = [logger.name for logger in Run(settings)._make_loggers()]
     assert found == (["TensorBoard"] if wanted else [])
 
 
@@ -108,7 +107,7 @@ def test_a_run_goes_on_where_tensorboard_cannot_be_written(
     # Acts as if TensorBoard were not installed.
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     monkeypatch.setitem(sys.modules, "tensorboardX.event_file_writer", None)
-    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, {}, loggers=[Boards(tmp_path, [0], [])]) as record:
         for update in range(2):
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 2
@@ -117,7 +116,7 @@ def test_a_run_goes_on_where_tensorboard_cannot_be_written(
 
 
 def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path) -> None:
-    with Recorder(tmp_path, loggers=[Boards(tmp_path, [3, 4], [])]) as record:
+    with Recorder(tmp_path, {}, loggers=[Boards(tmp_path, [3, 4], [])]) as record:
         rows = [_row(update, seed) | {f"at{update}": 1.0} for update in range(4) for seed in (3, 4)]
         record.write(rows, [], {"speed": 2.0})
     assert {path.name for path in tmp_path.glob("tensorboard/*")} == {"seed3", "seed4"}
@@ -135,8 +134,6 @@ def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path)
 def test_a_run_ends_though_the_disk_was_full_for_tensorboard(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The thread of tensorboardX's own writer died, and the run waited for its full queue."""
-
     write, left = RecordWriter.write, [5]
 
     def until_full(self: RecordWriter, data: bytes) -> None:
@@ -146,7 +143,7 @@ def test_a_run_ends_though_the_disk_was_full_for_tensorboard(
         write(self, data)
 
     monkeypatch.setattr(RecordWriter, "write", until_full)
-    with Recorder(tmp_path, loggers=[Boards(tmp_path, [0], [])]) as record:
+    with Recorder(tmp_path, {}, loggers=[Boards(tmp_path, [0], [])]) as record:
         for update in range(300):
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 300

@@ -180,7 +180,7 @@ def test_import_needs_neither_jax_nor_hydra():
         "[64,64]."),
         (["algo.hidden_sizes=[64,0]"], "algo.hidden_sizes is [64,0]: give 1 to 4096."),
         (["algo.activation=gelu"], "algo.activation is 'gelu': give tanh, relu or swish."),
-        (["run.chunk=some"], "run.chunk is 'some': give a whole number, all or auto."),
+        (["run.chunk=some"], "run.chunk is 'some': give a whole number or auto."),
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),

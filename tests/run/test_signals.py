@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import pytest
 
 from swarmjax.exit_codes import INTERRUPTED, REQUEUE
-from swarmjax.run.signals import Stop, StoppedError
+from swarmjax.run.signals import ONE_S, Stop, StoppedError
 
 # A program that listens for signals, prints so, and then waits as its argument says.
 _PROCESS = """
@@ -73,7 +73,7 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(ignored: int) -> No
 def test_a_second_signal_ends_the_process_even_within_a_call() -> None:
     process = _start("call")
     process.send_signal(signal.SIGTERM)
-    time.sleep(0.3)
+    time.sleep(1.5 * ONE_S)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=10)
     assert process.returncode == REQUEUE  # the code of the first signal
@@ -89,6 +89,23 @@ def test_nothing_to_save_is_an_error_of_its_own() -> None:
             time.sleep(0.01)
         with pytest.raises(StoppedError):
             stop.check()
+
+
+def test_a_signal_that_comes_twice_at_once_counts_once() -> None:
+    process = _start("poll")
+    process.send_signal(signal.SIGUSR1)
+    process.send_signal(signal.SIGUSR1)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == REQUEUE
+    assert "stopped at once" not in said
+
+
+def test_a_stop_has_a_time_of_its_own() -> None:
+    assert not Stop().asked
+    assert not Stop(until=time.monotonic() + 3600.0).asked
+    over = Stop(until=time.monotonic())
+    assert over.asked
+    assert not over.signalled
 
 
 def test_signals_are_given_back() -> None:

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from sentences import refusal
 
-from swarmjax.run import checkpoint, trainer
-from swarmjax.run.display import Display
+from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
+from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
-from swarmjax.run.signals import Stop
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.training import episodes, seeds
 from swarmjax.training import program as programs
@@ -114,18 +113,16 @@ def train_for(tiny_config: TrainConfig) -> Train:
     )
     program, schedule = programs.load(base, by_robot=True)
     init = jax.jit(partial(seeds.init, program))
-    compiled = trainer.compile_chunk(program, schedule, init(schedule))
+    compiled = compile_chunk(program, schedule, init(schedule))
 
     def train_for(run: Path, updates: int, *, resume: bool = False) -> None:
         settings = replace(
             base, run=replace(base.run, stop_after=updates), resume=str(run) if resume else None
         )
-        state = init(schedule)
-        if resume:
-            state = checkpoint.from_leaves(checkpoint.find(run)[0], state)
-        mine = replace(program, config=settings)
-        with Stop() as stop, Display(6) as display:
-            trainer.train(run, mine, schedule, compiled, state, display, stop)
+        mine = Run(settings)
+        mine.path, mine.compiled = run, compiled
+        mine.load()
+        mine._train_chunks()
 
     return train_for
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax.run import trainer
+from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
@@ -33,7 +33,7 @@ def main(out: str, devices: str, words: str, *more: str) -> None:
     config = load_train([*WORDS, *words.split(), f"devices={devices}"])
     program, schedule = programs.load(config)
     state = jax.jit(mesh.init(program))(schedule)
-    call: Any = trainer.compile_chunk(program, schedule, state).call
+    call: Any = compile_chunk(program, schedule, state).call
     state, metrics = call(schedule, state, np.int32(config.updates))
     found = {
         jax.tree_util.keystr(path): np.asarray(leaf)

@@ -10,8 +10,8 @@ import chromium
 import pytest
 from runs import CONFIG, row, write
 
-from swarmjax.run import lifecycle
 from swarmjax.run.checkpoint import Checkpoints
+from swarmjax.run.run import Run
 from swarmjax.run.settings import RunConfig
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.server import Server
@@ -29,9 +29,10 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
     """Returns the views of a killed run of two seeds, whose directory's name is an HTML tag."""
     rows = [row(update, seed) for update in range(TRAINED.updates - 1) for seed in (0, 1)]
     run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
-    _, _, state = lifecycle.begin(TRAINED)
+    begun = Run(TRAINED)
+    begun.load()
     with Checkpoints(run, keep=1) as checkpoints:
-        checkpoints.save(state, 0)
+        checkpoints.save(begun.state, 0)
     made = Views(WatchConfig(run=str(run)))
     made.draw()
     made.record()

@@ -1,0 +1,83 @@
+"""Compiles the program of a run ahead of time, and says how much memory it needs."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from swarmjax import provenance
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training import loop, mesh, seeds
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """The compiled chunk, the time to compile it, and the memory that it needs.
+
+    Attributes:
+      call: (schedule, state [N], n) -> (state [N], metrics [N, rows]). The state is donated.
+      seconds: time spent tracing and compiling.
+      state_bytes: device memory for the training state.
+      work_bytes: device memory that the program needs beyond the state.
+    """
+
+    call: Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
+    seconds: float
+    state_bytes: int
+    work_bytes: int
+
+    @property
+    def total_bytes(self) -> int:
+        """Device memory that training needs."""
+        return self.state_bytes + self.work_bytes
+
+
+def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any) -> Compiled:
+    """Compiles `seeds.train_chunk` ahead of time.
+
+    Args:
+      program: the run's program.
+      schedule: the curriculum's numbers.
+      state: [N] a state, or its shapes from `jax.eval_shape`.
+
+    Returns:
+      The program to call.
+    """
+    began = time.perf_counter()
+    groups = programs.groups(program.config, provenance.cores())
+    part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
+    lowered = mesh.jit_chunk(program).lower(schedule, part, np.int32(1))
+    fixed = program.config.run.deterministic
+    call = lowered.compile(loop.compiler_options(deterministic=fixed))
+    needed = call.memory_analysis()
+    assert needed is not None  # both CPU and GPU report it
+    # The returned state reuses the memory of the donated state. Only the metrics need more memory.
+    returned = needed.output_size_in_bytes - needed.alias_size_in_bytes
+    return Compiled(
+        call=call if groups == 1 else partial(_call_at_once, call, groups),
+        seconds=time.perf_counter() - began,
+        state_bytes=groups * needed.argument_size_in_bytes,
+        work_bytes=groups * (needed.temp_size_in_bytes + returned),
+    )
+
+
+def _call_at_once(
+    call: Callable[..., Any], groups: int, schedule: Schedule, state: TrainState, n: np.int32
+) -> tuple[TrainState, dict]:
+    """Runs each group of seeds in a thread of its own, because XLA uses one core per group."""
+
+    def one(part: TrainState) -> tuple[TrainState, dict]:
+        return jax.block_until_ready(call(schedule, part, n))
+
+    parts = jax.jit(seeds.split, static_argnums=1)(state, groups)
+    with ThreadPoolExecutor(groups) as pool:
+        return jax.jit(seeds.join)(list(pool.map(one, parts)))

@@ -1,0 +1,95 @@
+"""Writes what a run ends with: a policy for each seed, and `summary.json`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from swarmjax import provenance
+from swarmjax.policy import PolicyError
+from swarmjax.run import directory
+from swarmjax.run.checkpoint import Leaves
+from swarmjax.run.directory import DECISIONS, METRICS, SUMMARY, Row
+from swarmjax.run.errors import TrainingError
+from swarmjax.run.policy_export import POLICY, seed_path, write_policy
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training.program import Program
+
+
+def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int) -> None:
+    """Writes the policy of every seed.
+
+    Raises:
+      TrainingError: if one cannot be written.
+    """
+    for seed in settings.numbers:
+        try:
+            write_policy(seed_path(run / POLICY, settings, seed), leaves, settings, update, seed)
+        except PolicyError as error:  # such as a full disk
+            raise TrainingError(str(error)) from None
+
+
+def is_current(run: Path, updates: int) -> bool:
+    """Returns whether the summary, the last file of a run, says that this budget was spent."""
+    try:
+        summary = json.loads((run / SUMMARY).read_text())
+        return summary["budget_spent"] is True and summary["updates"] == updates
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
+
+
+def write_summary(run: Path, program: Program[TrainConfig], updates: int, compile_s: float) -> None:
+    """Writes `summary.json`, with the totals of the logs.
+
+    Args:
+      run: the run directory.
+      program: the run's program.
+      updates: updates that every seed has done.
+      compile_s: seconds spent compiling.
+    """
+    settings, engine = program.config, program.world.physics.engine
+    rows = directory.read_rows(run / METRICS, None)
+    steps = updates * settings.arenas * settings.algo.rollout_length
+    train_s = rows[-1]["train_s"] if rows else 0.0
+    transitions = sum(row["transitions"] for row in rows)
+    directory.write_json(
+        run / SUMMARY,
+        {
+            "stage": settings.stage_name,
+            "stages": settings.stage_names,
+            "seeds": [*settings.numbers],
+            "updates": updates,
+            "budget_spent": updates >= settings.updates,
+            "arena_steps": steps,
+            "train_s": train_s,
+            "compile_s": compile_s,
+            "arena_steps_per_s": settings.seeds * steps / train_s if train_s else None,
+            "transitions_per_s": transitions / train_s if train_s else None,
+            **_by_seed(settings, rows, directory.read_rows(run / DECISIONS, None)),
+            "impl": engine.impl,
+            "solver": engine.solver,
+            "stepped_by": engine.label,
+            "update_backend": program.ppo.backend,
+            "device": provenance.device(),
+            "versions": provenance.versions(),
+            "commit": provenance.commit(),
+        },
+    )
+
+
+def _by_seed(settings: TrainConfig, rows: list[Row], decisions: list[Row]) -> dict[str, list[Any]]:
+    """Returns the totals of each seed, in the order of the seeds."""
+    transitions = dict.fromkeys(settings.numbers, 0)
+    reached: dict[int, dict[str, float]] = {seed: {} for seed in settings.numbers}
+    for row in rows:
+        transitions[row["seed"]] += row["transitions"]
+    for row in rows[-settings.seeds :]:
+        shares = zip(settings.stage_names, row["success_by_stage"], strict=True)
+        reached[row["seed"]] = {stage: share for stage, share in shares if share is not None}
+    return {
+        "transitions": [*transitions.values()],
+        "targets_reached": [*reached.values()],
+        "decisions": [
+            [entry for entry in decisions if entry["seed"] == seed and "to" in entry]
+            for seed in settings.numbers
+        ],
+    }

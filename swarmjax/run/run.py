@@ -1,0 +1,407 @@
+"""A training run, from its settings to its finished directory. Read `Run.train` first."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from swarmjax import words
+from swarmjax.config import ConfigError, reading, to_dict
+from swarmjax.curriculum.engine import Schedule
+from swarmjax.curriculum.log import log
+from swarmjax.run import (
+    checkpoint,
+    compile_cache,
+    directory,
+    hosts,
+    memory,
+    recorder,
+    results,
+    sentences,
+    warm_start,
+    weights_and_biases,
+)
+from swarmjax.run.checkpoint import Checkpoints, Kept
+from swarmjax.run.compiled import Compiled, compile_chunk
+from swarmjax.run.directory import EPISODES, METRICS, Row
+from swarmjax.run.display import Display, figures
+from swarmjax.run.errors import TrainingError
+from swarmjax.run.load_settings import read_config
+from swarmjax.run.loggers import Logger
+from swarmjax.run.policy_export import POLICY, seed_path
+from swarmjax.run.recorder import Recorder
+from swarmjax.run.settings import TrainConfig
+from swarmjax.run.signals import Stop
+from swarmjax.run.tensorboard import Boards
+from swarmjax.run.weights_and_biases import WandbRuns
+from swarmjax.sim import physics
+from swarmjax.training import episodes, mesh
+from swarmjax.training import program as programs
+from swarmjax.training.loop import TrainState
+from swarmjax.training.program import Program
+
+CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
+# There is a checkpoint at least after this share of the budget, so that a short run has some too.
+BUDGET_SHARE = 0.1
+GROWTH = 4  # a call is at most this many times as long as the previous one
+PATIENCE = 10  # a run has diverged after this many updates in a row without learning
+
+
+class Run:
+    """A training run.
+
+    Attributes:
+      settings: its config.
+      path: its directory, once it is open.
+      program: the parts that fix the compiled program, once it is loaded.
+      schedule: the curriculum's numbers, an argument of the program.
+      state: [N] the training state.
+      compiled: the program to call, once it is compiled.
+      update: updates that every seed has done.
+    """
+
+    program: Program[TrainConfig]
+    schedule: Schedule
+    state: Any
+    compiled: Compiled
+
+    def __init__(
+        self,
+        settings: TrainConfig,
+        *,
+        stop: Stop | None = None,
+        display: Display | None = None,
+        loggers: Sequence[Logger] = (),
+        on_update: Callable[[Row], object] | None = None,
+    ) -> None:
+        """Prepares a run, but does nothing yet.
+
+        Args:
+          settings: the config.
+          stop: notices signals; None: the run cannot be stopped.
+          display: shows the run; None: nothing is shown.
+          loggers: receive the rows, beside the loggers that the config names.
+          on_update: called with a copy of each row; it returns True to stop the run.
+        """
+        self.settings = settings
+        self._stop = stop or Stop()
+        self._display = display or Display(Console(quiet=True))
+        self._loggers, self._on_update = loggers, on_update or (lambda row: None)
+        self.path, self.update = Path(), 0
+        self._kept: Kept | None = None
+        self._first, self._seconds, self._earlier_s = 0, 0.0, 0.0
+        self._newest: list[Row] = []  # the last row of each seed
+        self._barren: Counter[int] = Counter()  # newest updates in a row that taught nothing
+        self._saved = (0.0, 0)  # time and update of the newest checkpoint
+
+    def train(self) -> None:
+        """Trains the run and writes its directory; with `resume` the run goes on.
+
+        Raises:
+          ConfigError: if the config cannot be run, training needs more memory than there is, or
+            another process is writing the directory.
+          CheckpointError: if the checkpoint or logs of a resumed run are damaged.
+          TrainingError: if the run diverges, or its directory can no longer be written.
+          LostPeerError: if another process of the run is gone.
+          StoppedError: if a stop was requested before there was anything to save.
+        """
+        hosts.join(self.settings)
+        refusal = memory.refusal(self.settings)
+        with compile_cache.use(), self._display, hosts.lost_peers(), refusal, self._directory():
+            self.load()
+            if self.update < self.settings.updates:
+                self.compile()
+            if self.settings.run.dry:
+                return
+            if not self._is_finished():
+                self._open_files()
+                self._train_chunks()
+                self._write_results()
+            self._display.say(sentences.success(self.settings, self._newest))
+            self._display.say(sentences.closing(self.settings, self.path, self.update))
+
+    @contextmanager
+    def _directory(self) -> Iterator[None]:
+        """Makes or opens the run directory, and keeps other processes out of it."""
+        weights_and_biases.check(self.settings)
+        if self.settings.run.dry:
+            yield
+            return
+        chosen = self._choose_path() if hosts.is_first() else Path()
+        claimed = self.settings.run.dir is None
+        with hosts.own_directory(chosen) as self.path, directory.locked(self.path, claimed=claimed):
+            if hosts.is_first():  # the other processes' folders link to the first one's checkpoints
+                check_free(self.path, self.settings)
+            name = self.settings.run.id or hosts.share_text(directory.new_id())
+            self.settings = replace(self.settings, run=replace(self.settings.run, id=name))
+            try:
+                yield
+            except (OSError, TrainingError) as error:
+                raise self._broken(error) from None
+
+    def _choose_path(self) -> Path:
+        """Returns the run directory that the config names, or makes one."""
+        if self.settings.run.dir is not None:
+            check_free(Path(self.settings.run.dir), self.settings)
+            return Path(self.settings.run.dir)
+        every = self.settings.numbers
+        seed = f"seed{every[0]}" if len(every) == 1 else f"seeds{every[0]}-{every[-1]}"
+        name = f"{datetime.now():%Y%m%d-%H%M%S}-{self.settings.stage_name}-{seed}"
+        try:
+            return directory.claim(Path("runs"), name)
+        except OSError as error:
+            raise directory.unwritable(Path("runs") / name, error) from None
+
+    def _broken(self, error: OSError | TrainingError) -> TrainingError:
+        """Says why the run ends, and what is left of it."""
+        why = str(error)
+        if isinstance(error, OSError):
+            why = f"{self.path} cannot be written: {error.strerror or error}."
+        saved = f" What was saved before is in {self.path}." if checkpoint.steps(self.path) else ""
+        return TrainingError(f"{why}{saved}")
+
+    def load(self) -> None:
+        """Builds the program and the first state, from the seed or from a checkpoint."""
+        self._stop.check()
+        settings, self._kept = self.settings, self._read_checkpoint()
+        source = warm_start.read(settings) if self._kept is None else None
+        with self._display.working("building the arenas"):
+            self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
+            init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
+            shapes = init.eval_shape(self.schedule)
+            memory.check_state(settings, mesh.bytes_each(settings, shapes), memory.limit())
+            self.state = shapes if settings.run.dry else self._first_state(init, shapes, source)
+        for sentence in sentences.first(self.program, self.path, self._kept, source):
+            self._display.say(sentence)
+
+    def _read_checkpoint(self) -> Kept | None:
+        """Reads the newest sound checkpoint of the resumed run, if there is one."""
+        settings = self.settings
+        if settings.resume is None or not checkpoint.steps(Path(settings.resume)):
+            return None
+        directory.check_regular(Path(settings.resume))
+        kept = checkpoint.find(Path(settings.resume))
+        if kept.update > settings.updates:
+            spent = kept.update * settings.arenas * settings.algo.rollout_length
+            raise ConfigError(
+                f"budget is {settings.budget}, but {settings.resume} has spent {spent} already: "
+                "give at least that."
+            )
+        past = directory.read_rows(Path(settings.resume) / METRICS, kept.logs.get(METRICS, 0))
+        self._newest = past[-settings.seeds :]
+        self._earlier_s = self._newest[-1]["train_s"] if past else 0.0
+        self.update = self._first = kept.update
+        return kept
+
+    def _first_state(
+        self, init: Callable[[Schedule], TrainState], shapes: TrainState, source: Kept | None
+    ) -> TrainState:
+        if self._kept is None:
+            state = init(self.schedule)
+            return state if source is None else warm_start.carry(source, state, self.settings)
+        return mesh.put(self.program, checkpoint.from_leaves(self._kept.leaves, shapes))
+
+    def compile(self) -> None:
+        """Compiles the program and claims its memory, so that training cannot run out later."""
+        with self._display.working("compiling"):
+            self._stop.check()
+            compiled = compile_chunk(self.program, self.schedule, self.state)
+            memory.check(self.settings, compiled.total_bytes, memory.limit())
+            began = time.perf_counter()
+            if not self.settings.run.dry:
+                self._claim(compiled)
+            seconds = compiled.seconds + time.perf_counter() - began
+            self.compiled = replace(compiled, seconds=seconds)
+            self._stop.check()
+        for sentence in sentences.compiled(self.compiled, dry=self.settings.run.dry):
+            self._display.say(sentence)
+
+    def _claim(self, compiled: Compiled) -> None:
+        """Builds Warp's kernels, and allocates the program's memory."""
+        loaded = self.program.world.physics
+        if loaded.engine.builds_kernels:
+            physics.build_kernels(loaded, mesh.stepped_together(self.program, self.state))
+        # A call with zero updates changes nothing, but allocates the program's working memory.
+        self.state, _ = jax.block_until_ready(compiled.call(self.schedule, self.state, np.int32(0)))
+
+    def _is_finished(self) -> bool:
+        """Returns whether the run was finished before: its budget is spent, and all is written."""
+        spent = self.update == self.settings.updates
+        return spent and bool(hosts.share(results.is_current(self.path, self.update))[0])
+
+    def _open_files(self) -> None:
+        """Writes `config.json`, and brings the logs of a run that is resumed from elsewhere."""
+        stored = to_dict(replace(self.settings, resume=None))
+        if self.settings.resume is not None:
+            source = Path(self.settings.resume)
+            stored = directory.kept_config(read_config(source), stored)
+            if self._kept is not None:
+                directory.bring(source, self.path, self._kept.logs)
+        try:
+            directory.write_json(self.path / directory.CONFIG, stored)
+        except OSError as error:
+            raise directory.unwritable(self.path, error) from None
+
+    def _train_chunks(self) -> None:
+        """Trains until the budget is spent, `run.stop_after` is reached or a stop is requested.
+
+        A thread writes the checkpoints while training continues.
+        """
+        options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
+        resumed = None if self._kept is None else self.update
+        with (
+            Recorder(
+                self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
+            ) as record,
+            Checkpoints(self.path, options.keep_checkpoints, resumed) as checkpoints,
+        ):
+            self._save(checkpoints, record)
+            for n in self._chunks():
+                began = time.perf_counter()
+                self.state, metrics = self.compiled.call(self.schedule, self.state, np.int32(n))
+                metrics = jax.device_get(hosts.gather(metrics))
+                self._report(metrics, n, time.perf_counter() - began, record)
+                if self._is_checkpoint_due():
+                    self._save(checkpoints, record)
+            self._save(checkpoints, record)
+
+    def _make_loggers(self) -> list[Logger]:
+        """Makes the loggers that the config names, beside those that were given."""
+        settings, found = self.settings, list(self._loggers)
+        if settings.run.tensorboard:
+            steps = self.update * settings.arenas * settings.algo.rollout_length
+            purge = steps + 1 if self.update else None
+            found.append(Boards(self.path, settings.numbers, settings.stage_names, purge))
+        if settings.run.wandb and hosts.is_first():
+            found.append(WandbRuns(settings, self.path))
+        return found
+
+    def _chunks(self) -> Iterator[int]:
+        """Yields the number of updates for each call, until the run is done or should stop."""
+        settings, n = self.settings, 1
+        last = settings.run.stop_after
+        goal = settings.updates if last is None else min(settings.updates, last)
+        while self.update < goal and not self._must_stop():
+            if settings.run.chunk != "auto":
+                n = settings.run.chunk
+            elif self._seconds:
+                n = int(np.clip(CALL_SECONDS / self._pace, 1, GROWTH * n))
+            yield int(hosts.share(min(n, goal - self.update, self.program.rows))[0])
+
+    @property
+    def _pace(self) -> float:
+        """Mean seconds per update in this process."""
+        return self._seconds / (self.update - self._first)
+
+    def _must_stop(self) -> bool:
+        """Returns whether any process of the run was asked to stop; all get the same exit code."""
+        stop = self._stop
+        if hosts.count() == 1:
+            return stop.asked
+        code = int(hosts.share((stop.code or 1) if stop.asked else 0).max())
+        if code > 1:
+            stop.code = stop.code or code
+        return code > 0
+
+    def _report(self, metrics: dict[str, Any], n: int, seconds: float, record: Recorder) -> None:
+        """Logs a call and shows it."""
+        settings, ended = self.settings, metrics.pop(episodes.KEY, None)
+        names, steps = settings.stage_names, settings.arenas * settings.algo.rollout_length
+        self.update += n
+        self._seconds += seconds
+        train_s = {"train_s": self._earlier_s + self._seconds}
+        rows: list[Row] = [
+            row | train_s for row in recorder.rows(metrics, n, names, settings.numbers, steps)
+        ]
+        self._newest = rows[-settings.seeds :]
+        decisions = [entry for row in rows for entry in log([row], names, row["seed"])]
+        speeds = recorder.speeds(settings, rows, seconds) | {"compile_s": self.compiled.seconds}
+        record.write(rows, decisions, speeds)
+        if ended is not None:
+            self._log_episodes(ended, np.arange(self.update - n, self.update), record)
+        self._check_learning(rows)
+        for sentence in sentences.promotions(settings, decisions):
+            self._display.say(sentence)
+        left = self._pace * (settings.updates - self.update)
+        self._display.show(figures(rows, names, speeds), self.update, settings.updates, left)
+        for row in rows:
+            self._stop.signalled |= self._on_update(dict(row)) is True
+
+    def _log_episodes(
+        self, ended: episodes.EpisodeLog, updates: np.ndarray, record: Recorder
+    ) -> None:
+        settings = self.settings
+        steps = settings.arenas * settings.algo.rollout_length
+        rows, lost = episodes.rows(ended, updates, settings.stage_names, settings.numbers, steps)
+        record.write_episodes(rows)
+        if lost:
+            self._display.say(
+                f"{EPISODES} lacks {words.count(lost, 'episode')} up to update "
+                f"{updates[-1]:,}: more episodes ended than the buffer can hold."
+            )
+
+    def _check_learning(self, rows: list[Row]) -> None:
+        """Ends the run after `PATIENCE` updates in a row that taught nothing.
+
+        In such an update every gradient step was skipped, or every arena broke at every step.
+        """
+        steps = self.settings.arenas * self.settings.algo.rollout_length
+        for row in rows:
+            broke, seed = row["broken_arenas"] >= steps, row["seed"]
+            barren = broke or row["policy_loss"] is None
+            self._barren[seed] = self._barren[seed] + 1 if barren else 0
+            if self._barren[seed] == PATIENCE:
+                raise TrainingError(sentences.diverged(self.settings, row, PATIENCE, broke=broke))
+
+    def _is_checkpoint_due(self) -> bool:
+        """Returns whether to save now, by time or by share of the budget."""
+        options, (when, update) = self.settings.run, self._saved
+        by_time = time.monotonic() - when > 60.0 * options.checkpoint_minutes
+        by_share = BUDGET_SHARE * self.settings.updates <= self.update - update
+        due = bool(hosts.share(by_time or by_share)[0])
+        return due and not any(self._barren.values())
+
+    def _save(self, checkpoints: Checkpoints, record: Recorder) -> None:
+        """Begins to write a checkpoint, unless this update is saved already."""
+        about = {"budget": self.settings.budget, "streams": self.settings.stream_count}
+        checkpoints.save(self.state, self.update, record.sync(), of=about)
+        self._saved = (time.monotonic(), self.update)
+
+    def _write_results(self) -> None:
+        """Writes the policies and the summary, and says how good the swarm is and what to do."""
+        leaves = checkpoint.to_leaves(hosts.gather(self.state))
+        results.write_policies(self.path, self.settings, leaves, self.update)
+        compile_s = self.compiled.seconds if self.update > self._first else 0.0
+        results.write_summary(self.path, self.program, self.update, compile_s)
+
+    @property
+    def policies(self) -> list[Path]:
+        """The policy file of each seed."""
+        settings = self.settings
+        return [seed_path(self.path / POLICY, settings, seed) for seed in settings.numbers]
+
+
+def check_free(run: Path, settings: TrainConfig) -> None:
+    """Refuses a directory that is not empty, unless it holds the run that is resumed."""
+    directory.check_regular(run)
+    if settings.resume is not None and Path(settings.resume).resolve() == run.resolve():
+        return
+    held = directory.visible(run)
+    if directory.CONFIG in held:
+        raise ConfigError(
+            f"run.dir is {run}, which holds a run already: give another directory, or "
+            f"resume={run} to go on with it."
+        )
+    if held:
+        raise ConfigError(
+            f"run.dir is {run}, which holds {reading.called(held[0])}: give a new or an empty "
+            "directory."
+        )

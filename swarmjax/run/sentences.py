@@ -1,0 +1,106 @@
+"""What a run says: what it trains, how it is going, how good the swarm is, and what comes next."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+from swarmjax import command, provenance, words
+from swarmjax.run import checkpoint
+from swarmjax.run.checkpoint import Kept
+from swarmjax.run.compiled import Compiled
+from swarmjax.run.directory import Row
+from swarmjax.run.display import spread
+from swarmjax.run.policy_export import POLICY, seed_path
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training.program import Program
+
+
+def first(
+    program: Program[TrainConfig], run: Path, kept: Kept | None, source: Kept | None
+) -> Iterator[str]:
+    """Describes what is trained, which engine steps the robots, and what the run starts from."""
+    settings, engine = program.config, program.world.physics.engine
+    steps, seeds = settings.arenas * settings.algo.rollout_length, settings.numbers
+    several = f", seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else ""
+    yield (
+        f"swarmjax: {settings.stage_name} ({', '.join(settings.stage_names)}), "
+        f"{words.count(settings.updates, 'update')} of {words.count(steps, 'arena control step')} "
+        f"({words.count(settings.arenas, 'arena')}){several} on "
+        f"{provenance.device()}; {settings.robot.body} robots stepped by {engine.label}, "
+        f"sim.solver={engine.solver} sim.impl={engine.impl}; into {run}"
+    )
+    if settings.extensions is not None:
+        used = (f"{kind} {name}" for kind, names in settings.pieces.items() for name in names)
+        yield f"from {settings.extensions}: {', '.join(used) or 'nothing is used'}"
+    skipped = [] if kept is None else kept.skipped
+    for sentence in skipped if source is None else source.skipped:
+        yield f"{sentence}: it was passed over."
+    if kept is not None and kept.update == settings.updates:
+        yield "nothing left to train: the budget is spent; for more, give a larger budget"
+    if settings.resume is not None and kept is None:
+        yield f"{settings.resume} has no checkpoint yet: the run begins from its seed."
+    if source is not None:
+        updates = words.count(source.update, "update")
+        yield (
+            f"starting with the networks and the normaliser of {settings.init_from} after {updates}"
+        )
+
+
+def compiled(program: Compiled, *, dry: bool) -> Iterator[str]:
+    """Says how long compiling took; in a dry run, also how much memory training needs."""
+    yield f"compiled in {words.duration(program.seconds)}"
+    if dry:
+        state, work = program.state_bytes / 2**20, program.work_bytes / 2**20
+        yield (
+            f"memory: {state:.1f} MiB of state, {work:.1f} MiB to work with; nothing was trained "
+            "(run.dry)."
+        )
+
+
+def promotions(settings: TrainConfig, decisions: Iterable[Row]) -> Iterator[str]:
+    """Describes each change of stage. The other decisions are many and only go to the log."""
+    for entry in decisions:
+        if "to" in entry:
+            seed = f"seed {entry['seed']}, " if settings.seeds > 1 else ""
+            yield (
+                f"{seed}update {entry['update'] + 1}: {entry['from']} -> {entry['to']} by "
+                f"{entry['why']} (targets reached: {spread([entry['targets_reached']])})"
+            )
+
+
+def diverged(settings: TrainConfig, row: Row, updates: int, *, broke: bool) -> str:
+    """Says that a run has stopped learning: all arenas broke, or no gradient step was finite."""
+    where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
+    what = f"every arena{where} broke at every step"
+    if not broke:
+        what = f"no gradient step{where} was finite"
+    return (
+        f"{what} in {words.count(updates, 'update')} up to update {row['update'] + 1:,}: give "
+        "lower algo.actor_learning_rate and algo.critic_learning_rate, or look at metrics.jsonl "
+        "for what broke."
+    )
+
+
+def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
+    """Describes how good the swarm is on the last stage, by the last row of each seed."""
+    shares = [row["success_by_stage"][-1] for row in newest]
+    said = f"targets reached on {settings.stage_names[-1]}: {spread(shares)}"
+    if all(share is None for share in shares):
+        return f"{said}: no whole cohort of episodes has ended"
+    steps = settings.task.step_limit
+    seconds = steps * settings.task.control_step
+    return f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of episodes"
+
+
+def closing(settings: TrainConfig, run: Path, update: int) -> str:
+    """Describes what to do next with a run that has done `update` updates."""
+    code = [] if settings.extensions is None else [f"extensions={settings.extensions}"]
+    if update < settings.updates:
+        saved = max(checkpoint.steps(run), default=0)
+        how = "saved" if saved == update else f"saved at update {saved:,}, the last sound one"
+        return (
+            f"stopped after update {update:,} of {settings.updates:,}, {how}; go on with: "
+            f"{command.line('train', f'resume={run}', *code)}"
+        )
+    policy = seed_path(run / POLICY, settings, settings.seed)
+    what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
+    return f"done; judge {what} with: {command.line('evaluate', f'policy={policy}', *code)}"
