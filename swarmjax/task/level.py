@@ -93,14 +93,6 @@ class _Uniforms(NamedTuple):
     seed: Array
 
 
-class _Obstacles(NamedTuple):
-    """Placed obstacles: centres [M, 2] (units), presence [M], outer radius [] (units)."""
-
-    centre: Array
-    there: Array
-    radius: Array
-
-
 def uniform_count(spacing: Spacing) -> int:
     """Returns how many uniform numbers a level takes."""
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
@@ -154,7 +146,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     length = _side(stage, seed, xp)
     side = units(length, xp)
     present = xp.arange(spacing.robots) < stage.robots
-    around = _place_obstacles(drawn, stage, side, xp)
+    around = centre, there, _ = _place_obstacles(drawn, stage, side, xp)
     target = _place_targets(drawn, around, present, spacing, side, xp)
     start = _place_starts(drawn, around, target, present, spacing, side, xp)
     yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
@@ -165,9 +157,9 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
         present=present,
         start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
         target=metres(target, xp),
-        obstacle_present=around.there,
+        obstacle_present=there,
         obstacle=xp.concatenate(
-            [metres(around.centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
+            [metres(centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
         ),
         seed=seed,
     )
@@ -191,37 +183,49 @@ def _side(stage: Stage, seed: Array, xp: Any) -> Array:
     return xp.where(count > 1, metres(low + above, xp), stage.side)
 
 
-def _place_obstacles(drawn: _Uniforms, stage: Stage, side: Array, xp: Any) -> _Obstacles:
-    """Places randomly turned boxes, with a passage between all of their outer circles."""
+def _place_obstacles(
+    drawn: _Uniforms, stage: Stage, side: Array, xp: Any
+) -> tuple[Array, Array, Array]:
+    """Places randomly turned boxes, with a passage between all of their outer circles.
+
+    Returns:
+      Centres [M, 2] (units), presence [M], and the outer radius [] (units).
+    """
     radius = units(stage.obstacle_size * np.float32(math.sqrt(0.5)), xp) + 1
     gap = 2 * radius + round_up(PASSAGE)
     points = lattice(drawn.obstacle_shift, side, xp)
     score = score_walls(points, side, radius + round_up(PASSAGE), xp)
     there = xp.arange(drawn.obstacle.shape[0]) < stage.obstacles
     centre, there = place(points, score, drawn.obstacle, there, Gap(gap, gap), xp)
-    return _Obstacles(centre, there, radius)
+    return centre, there, radius
 
 
 def _place_targets(
-    drawn: _Uniforms, around: _Obstacles, present: Array, spacing: Spacing, side: Array, xp: Any
+    drawn: _Uniforms,
+    around: tuple[Array, Array, Array],
+    present: Array,
+    spacing: Spacing,
+    side: Array,
+    xp: Any,
 ) -> Array:
     """Places targets so that parked robots leave a way through; returns [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
+    centre, there, radius = around
     beside = Gap(
-        around.radius + clearance(hull),
+        radius + clearance(hull),
         # One robot parks on this side of its target while another one passes behind it.
-        around.radius + round_up(reach + 3.0 * hull),
+        radius + round_up(reach + 3.0 * hull),
     )
     apart = gaps_of(hull, reach).target
     points = lattice(drawn.target_shift, side, xp)
     score = score_walls(points, side, clearance(hull), xp)
-    score = xp.minimum(score, score_things(points, around.centre, around.there, beside, xp))
+    score = xp.minimum(score, score_things(points, centre, there, beside, xp))
     return place(points, score, drawn.target, present, apart, xp)[0]
 
 
 def _place_starts(
     drawn: _Uniforms,
-    around: _Obstacles,
+    around: tuple[Array, Array, Array],
     target: Array,
     present: Array,
     spacing: Spacing,
@@ -230,11 +234,12 @@ def _place_starts(
 ) -> Array:
     """Places starts clear of obstacles, targets and robots parked at targets; [R, 2] units."""
     hull, reach = spacing.hull_radius, spacing.target_radius
-    beside = clearance(hull) + around.radius
+    centre, there, radius = around
+    beside = clearance(hull) + radius
     _, from_target, apart = gaps_of(hull, reach)
     points = lattice(drawn.start_shift, side, xp)
     score = score_walls(points, side, clearance(hull), xp)
-    walled = score_things(points, around.centre, around.there, Gap(beside, beside), xp)
+    walled = score_things(points, centre, there, Gap(beside, beside), xp)
     clear = score_things(points, target, present, from_target, xp)
     score = xp.minimum(score, xp.minimum(walled, clear))
     return place(points, score, drawn.start, present, apart, xp)[0]
@@ -262,12 +267,17 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
     hull, reach = spacing.hull_radius, spacing.target_radius
     score = partial(_score_on_map, stage, arena, spacing, xp)
     target_apart, from_target, start_apart = gaps_of(hull, reach)
-    among = partial(_place_among, present=present, paired=paired, xp=xp)
+
+    def place_others(points: Array, score: Array, fixed: Array, gap: Gap, picks: Array) -> Array:
+        score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
+        placed, _ = place(points, score, picks, present & ~paired, gap, xp)
+        return xp.where(paired[:, None], fixed, placed)
+
     free = score(arena.target, arena.target_open)
-    target = among(arena.target, free, pair[:, 1], target_apart, drawn.target)
+    target = place_others(arena.target, free, pair[:, 1], target_apart, drawn.target)
     clear = score_things(arena.start, target, present, from_target, xp)
     free = xp.minimum(score(arena.start, arena.start_open), clear)
-    start = among(arena.start, free, pair[:, 0], start_apart, drawn.start)
+    start = place_others(arena.start, free, pair[:, 0], start_apart, drawn.start)
     yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
     wall = _rows(arena.wall, spacing.obstacles, xp)
     there = xp.arange(spacing.obstacles) < stage.obstacles
@@ -319,23 +329,6 @@ def _score_on_map(
     beside = score_rectangles(points, rectangle, there, gap, xp)
     within = score_walls(points, units(stage.side, xp), gap, xp)
     return xp.minimum(score_open(points, is_open, xp), xp.minimum(beside, within))
-
-
-def _place_among(
-    points: Array,
-    score: Array,
-    fixed: Array,
-    gap: Gap,
-    picks: Array,
-    *,
-    present: Array,
-    paired: Array,
-    xp: Any,
-) -> Array:
-    """Places starts or targets that have no fixed place, clear of fixed ones; [R, 2] units."""
-    score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
-    placed, _ = place(points, score, picks, present & ~paired, gap, xp)
-    return xp.where(paired[:, None], fixed, placed)
 
 
 def _rows(array: Array, count: int, xp: Any) -> Array:
