@@ -93,14 +93,6 @@ def test_no_mean_is_drawn_where_a_seed_has_no_episodes() -> None:
     assert _curve(figure, 0, 2.0) == []
 
 
-def test_final_policies_have_their_seeds_and_intervals() -> None:
-    shares = {("baseline", LAST): {"targets_reached": 0.75}}
-    figure = figures.final(reproduction(judged=shares), ("baseline",))
-    seeds, mean = figure.axes[0].lines[:2]
-    assert np.asarray(seeds.get_xdata()).tolist() == [0.75] * 3
-    assert np.asarray(mean.get_xdata()).tolist() == [0.75]
-
-
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     out = whole(tmp_path_factory.mktemp("out"), episodes=25, arms=("curriculum",))
