@@ -22,7 +22,6 @@ from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
-SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
 _POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
 COLOURS = {"curriculum": "#0072b2", "baseline": "#d55e00"}
 COLOURS |= {f"{arm}_expanded": colour for arm, colour in COLOURS.items()}
@@ -72,7 +71,7 @@ def png_files(data: Reproduction) -> dict[str, bytes]:
     for name, plot in PLOTS.items():
         arms = tuple(arm for arm in plot.arms if arm in data.logs)
         if arms:
-            files[name] = drawing.png(plot.make(data, arms), SHADES)
+            files[name] = drawing.png(plot.make(data, arms))
     return files
 
 

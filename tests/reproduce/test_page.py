@@ -5,14 +5,12 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
 from reproductions import SEEDS, SUMMARY, episode, row, whole, write
 from sentences import refusal
 
 from swarmjax.reproduce import claims as reproduce_claims
 from swarmjax.reproduce import page as reproduce_page
-from swarmjax.reproduce.config import ARMS
 from swarmjax.reproduce.rows import EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
@@ -175,34 +173,3 @@ def test_a_folder_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     out = whole(tmp_path, episodes=2, arms=("baseline",))
     (out / "figures").write_text("in the way")
     assert "cannot be written" in refusal(reproduce_page.write, out)
-
-
-@pytest.mark.slow
-def test_ten_seeds_of_six_arms_stay_below_two_megabytes(tmp_path: Path) -> None:
-    # All plotted numbers are random, so that compression gains nothing.
-    random = np.random.default_rng(0)
-    logs = {
-        arm: [
-            episode(
-                number,
-                seed=seed,
-                stage=EXPANDED if arm.endswith("_expanded") else LAST,
-                reached=random.integers(0, 2, 5).astype(bool).tolist(),
-                reward=random.normal(size=5).tolist(),
-                robot_steps=[100] * 5,
-                sensed=random.integers(0, 100, 5).tolist(),
-                contacts=random.integers(0, 20, 5).tolist(),
-            )
-            for seed in range(10)
-            for number in range(1, 2001)
-        ]
-        for arm in ARMS
-    }
-    judged = [
-        row(arm, seed, stage, targets_reached=random.random())
-        for arm in ARMS
-        for seed in range(10)
-        for stage in (LAST, EXPANDED)
-    ]
-    page = reproduce_page.write(write(tmp_path, logs, judged, seeds=10))
-    assert page.stat().st_size < 2_000_000
