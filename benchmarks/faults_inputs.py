@@ -34,7 +34,7 @@ from swarmjax.policy_file import read_meta
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.report import rows, table
 from swarmjax.report.config import ReportConfig
-from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
+from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
@@ -96,7 +96,7 @@ def _suite(words: Words) -> None:
 
 
 def _reproduce(words: Words) -> None:
-    load_reproduce(words)
+    files.load(ReproduceConfig, words)
 
 
 LOADERS: dict[str, tuple[Callable[[Words], None], type[Section]]] = {

@@ -22,7 +22,7 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.export.config import ExportConfig
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.report.config import ReportConfig
-from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
+from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
@@ -37,7 +37,7 @@ COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.export": (partial(files.load, ExportConfig), ExportConfig),
     "swarmjax.report": (partial(files.load, ReportConfig), ReportConfig),
     "swarmjax.replay": (partial(load_levels, ReplayConfig), ReplayConfig),
-    "swarmjax.reproduce": (load_reproduce, ReproduceConfig),
+    "swarmjax.reproduce": (partial(files.load, ReproduceConfig), ReproduceConfig),
     "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
     "swarmjax.verify": (partial(files.load, VerifyConfig), VerifyConfig),
     "swarmjax.watch": (partial(files.load, WatchConfig), WatchConfig),

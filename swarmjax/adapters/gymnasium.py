@@ -61,7 +61,6 @@ class SwarmVectorEnv(_vector.VectorEnv):
 
         Raises:
           Error: if the seed is not an integer, or only some sub-environments should be reset.
-          ClosedEnvironmentError: if the environment was closed.
         """
         if seed is not None and not isinstance(seed, int | np.integer):
             raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
@@ -84,7 +83,6 @@ class SwarmVectorEnv(_vector.VectorEnv):
         Raises:
           InvalidAction: if the actions have a wrong shape or dtype.
           ResetNeeded: if the environment was never reset.
-          ClosedEnvironmentError: if the environment was closed.
         """
         came = self._session.step(actions)
         every = np.ones(self.num_envs, bool)

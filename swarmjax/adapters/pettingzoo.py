@@ -62,9 +62,6 @@ class SwarmParallelEnv(_base):
 
         Returns:
           [O] observations and empty infos, by agent.
-
-        Raises:
-          ClosedEnvironmentError: if the environment was closed.
         """
         if seed is not None:
             self._random = np.random.default_rng(seed)
@@ -85,9 +82,7 @@ class SwarmParallelEnv(_base):
         Raises:
           InvalidAction: if an action is missing, names no agent, or has a wrong shape or dtype.
           ResetNeeded: if no agent is left.
-          ClosedEnvironmentError: if the environment was closed.
         """
-        self._session.check_open()
         if not self.agents:
             raise errors.ResetNeeded("No agent is left: call reset first.")
         came = self._session.step(self._stack(actions))

@@ -47,9 +47,6 @@ class SwarmVecEnv(_base):
 
         Returns:
           [N, O] observations.
-
-        Raises:
-          gymnasium.error.ClosedEnvironmentError: if the environment was closed.
         """
         if self._seeds[0] is not None:
             self._random = np.random.default_rng(self._seeds[0])
@@ -67,7 +64,6 @@ class SwarmVecEnv(_base):
         Raises:
           gymnasium.error.InvalidAction: if the actions have a wrong shape or dtype.
           gymnasium.error.ResetNeeded: if the environment was never reset.
-          gymnasium.error.ClosedEnvironmentError: if the environment was closed.
         """
         self._came = self._session.begin(actions)
 
@@ -80,7 +76,6 @@ class SwarmVecEnv(_base):
         Raises:
           gymnasium.error.NoAsyncCallError: if no step was started.
         """
-        self._session.check_open()
         if self._came is None:
             raise errors.NoAsyncCallError("step_wait: call step_async first.", "step")
         came, self._came = fetch(self._came), None

@@ -23,13 +23,12 @@ def spaces(robots: RobotRow) -> tuple[Any, Any]:
 
 
 class Session:
-    """Steps the robots, and checks that the environment was reset and not closed."""
+    """Steps the robots, and checks that the environment was reset."""
 
     def __init__(self, robots: RobotRow) -> None:
         self._robots = robots
         self._reset, self._step = jax.jit(robots.swarm.reset), jax.jit(robots.step)
         self._state: SwarmState | None = None
-        self._closed = False
 
     def reset(self, seed: int) -> np.ndarray:
         """Starts an episode in every arena.
@@ -39,11 +38,7 @@ class Session:
 
         Returns:
           [N, O] observations to act on.
-
-        Raises:
-          ClosedEnvironmentError: if the environment was closed.
         """
-        self.check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
         self._state = state
         return np.array(self._robots.observe(state))
@@ -58,11 +53,9 @@ class Session:
           The outcome, on the device.
 
         Raises:
-          ClosedEnvironmentError: if the environment was closed.
-          ResetNeeded: if the environment was never reset.
+          ResetNeeded: if the environment was never reset, or was closed.
           InvalidAction: if the action has a wrong shape or dtype.
         """
-        self.check_open()
         if self._state is None:
             raise errors.ResetNeeded("step was called before reset: call reset first.")
         action = np.asarray(action)
@@ -76,13 +69,8 @@ class Session:
         return fetch(self.begin(action))
 
     def close(self) -> None:
-        """Releases the state. No other method may be called afterwards."""
-        self._state, self._closed = None, True
-
-    def check_open(self) -> None:
-        """Raises ClosedEnvironmentError if the environment was closed."""
-        if self._closed:
-            raise errors.ClosedEnvironmentError("The environment was closed: make another one.")
+        """Releases the state."""
+        self._state = None
 
 
 def fetch(came: RobotStep) -> RobotStep:

@@ -36,7 +36,6 @@ class SwarmTorchEnv:
         self._reset = jax.jit(swarm.reset)
         self._observe, self._step = jax.jit(self._robots.observe), jax.jit(self._robots.step)
         self._state: SwarmState | None = None
-        self._closed = False
         self.arena = self._robots.arena
 
     def __len__(self) -> int:
@@ -50,11 +49,7 @@ class SwarmTorchEnv:
 
         Returns:
           [N, O] tensor of observations to act on.
-
-        Raises:
-          ValueError: if the environment was closed.
         """
-        self._check_open()
         state: SwarmState = self._reset(jax.random.key(seed))
         self._state = state
         return to_torch(self._observe(state))
@@ -69,10 +64,9 @@ class SwarmTorchEnv:
           The outcome, as tensors.
 
         Raises:
-          ValueError: if the action has a wrong shape, or the environment was closed or never reset.
+          ValueError: if the action has a wrong shape, or the environment was never reset.
           TypeError: if the action has a wrong dtype.
         """
-        self._check_open()
         if self._state is None:
             raise ValueError("step was called before reset: call reset first.")
         check(action, (len(self), self._robots.action_size))
@@ -80,12 +74,8 @@ class SwarmTorchEnv:
         return RobotStep(*map(to_torch, came))
 
     def close(self) -> None:
-        """Releases the state. No other method may be called afterwards."""
-        self._state, self._closed = None, True
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise ValueError("The environment was closed: make another one.")
+        """Releases the state."""
+        self._state = None
 
 
 def to_torch(array: jax.Array) -> Any:

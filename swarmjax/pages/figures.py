@@ -7,29 +7,16 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, PercentFormatter
-from PIL import Image
 
 WIDTH = 8.6  # inches
 _DOTS = 110  # per inch
 
 
-def png(figure: Figure, shades: int | None = None) -> bytes:
-    """Makes a PNG file of a figure. The same figure gives the same file in any Matplotlib version.
-
-    Args:
-      figure: the drawn figure.
-      shades: number of colours in the figure's own palette, up to 256; None for no palette.
-    """
-    content, small = io.BytesIO(), io.BytesIO()
+def png(figure: Figure) -> bytes:
+    """Makes a PNG file of a figure: the same file in any Matplotlib version."""
+    content = io.BytesIO()
     figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
-    if shades is None:
-        return content.getvalue()
-    image = Image.open(content).convert("RGB")
-    # Colours are chosen by coverage, since the median cut would give a short line another line's
-    # colour.
-    few = image.quantize(shades, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    few.save(small, format="png", optimize=True)
-    return small.getvalue()
+    return content.getvalue()
 
 
 def dress(panel: Axes, title: str, size: float = 10.0) -> None:

@@ -22,7 +22,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +30,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, check_text, to_dict
+from swarmjax.config import ConfigError, check_text, files, section, to_dict
 from swarmjax.evaluate import trials
 from swarmjax.exit_codes import FAILED
 from swarmjax.pages import builder
 from swarmjax.reproduce import arms, judge, page
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.config import ReproduceConfig, load_reproduce
+from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.judge import Task
 from swarmjax.reproduce.rows import EVALUATION, EXPANDED, FACTS, FORMAT, LAST
 from swarmjax.run.checkpoint import CheckpointError
@@ -79,22 +78,22 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
-    """Reads the command line; with `resume=`, applies allowed changes to the stored config."""
-    words = {key: value for key, _, value in (word.partition("=") for word in arguments)}
-    resumed = words.get("resume", "null").strip("'\"")
-    if resumed not in ("", "null"):
-        check_text("resume", resumed)
-        stored = reproduce_rows.read_facts(Path(resumed))["settings"]
-        return load_reproduce(arguments, stored), Path(resumed)
-    given = load_reproduce(arguments)
+    """Reads the command line, and with `resume` the settings of the reproduction to continue."""
+    given = files.load(ReproduceConfig, arguments)
+    if given.resume:
+        check_text("resume", given.resume)
+        others = files.parse(ReproduceConfig, arguments).keys() - {"resume", "minutes"}
+        if others:
+            raise ConfigError(f"{min(others)} cannot be given: resume takes minutes alone.")
+        stored = reproduce_rows.read_facts(Path(given.resume))["settings"]
+        more = {"resume": given.resume, "minutes": given.minutes}
+        return section.build_stored(ReproduceConfig, stored | more, ""), Path(given.resume)
     out = Path(given.out or f"runs/{datetime.now():%Y%m%d-%H%M%S}-reproduce")
-    if (out / FACTS).exists():
-        raise ConfigError(
-            f"out is {out}, which holds a reproduction already: give another directory, or "
-            f"resume={out} to go on with it."
-        )
     if out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"out is {out}, which is not empty: give a new or an empty folder.")
+        raise ConfigError(
+            f"out is {out}, which is not empty: give a new or an empty folder, or resume={out} to "
+            "go on with the reproduction in it."
+        )
     return given, out
 
 
@@ -105,8 +104,8 @@ def _write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _judge(out: Path, given: ReproduceConfig) -> None:
-    """Judges the policies that have not been judged yet on this number of episodes."""
-    rows = [row for row in reproduce_rows.read_rows(out) if row["episodes"] == given.episodes]
+    """Judges the policies that have not been judged yet."""
+    rows = reproduce_rows.read_rows(out)
     known = {(row["arm"], row["seed"], row["stage"]) for row in rows}
     tasks = [
         Task(arm, seed, out / arm / POLICY.replace(".", f"-seed{seed}."), stage)
@@ -119,8 +118,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
     progress.disable = not progress.console.is_terminal
     with progress:
         bar = progress.add_task("policies judged", total=len(tasks))
-        workers = min(given.workers or provenance.cores(), max(1, len(tasks)))
-        for row in trials.work(partial(judge.judge, given.episodes), tasks, workers):
+        for row in trials.work(judge.judge, tasks, min(provenance.cores(), len(tasks))):
             rows.append(row)
             progress.advance(bar)
     _write(out / EVALUATION, {"rows": rows})

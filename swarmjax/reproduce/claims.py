@@ -19,7 +19,7 @@ from swarmjax.pages import builder
 from swarmjax.reproduce import measures
 from swarmjax.reproduce.criteria import Criterion, about, crowded, earlier, higher, opposite, within
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
-from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction
+from swarmjax.reproduce.rows import EXPANDED, LAST, PAIR, TUNED, Reproduction
 
 GENERATED = 0.8  # share of targets that counts as the desired behaviour; also promotes from a stage
 FAILED = 0.5  # below this share of targets a swarm fails
@@ -233,14 +233,3 @@ def _read_claims() -> tuple[Claim, ...]:
 
 
 CLAIMS = _read_claims()
-# This project's own goals for the modern trainer, with mean actions.
-GOALS = tuple(
-    Reading(
-        f"{arm}, at least {100 * least:.0f} % of the targets on {stage}",
-        (arm,),
-        partial(measures.judged, key="targets_reached", stage=stage),
-        partial(within, low=least),
-    )
-    for arm in MODERN
-    for stage, least in ((LAST, 0.95), (EXPANDED, 0.90))
-)

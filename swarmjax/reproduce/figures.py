@@ -16,14 +16,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from swarmjax.evaluate import statistics
-from swarmjax.evaluate.statistics import curve, iqm
+from swarmjax.evaluate.statistics import curve
 from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import measures
-from swarmjax.reproduce.measures import AXES, FINAL, SHARE, WINDOW, Axis, Measure
+from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
-SHADES = 128  # colours in a file, a quarter of the size; each colour is off by at most 23 of 255
 _POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
 COLOURS = {"curriculum": "#0072b2", "baseline": "#d55e00"}
 COLOURS |= {f"{arm}_expanded": colour for arm, colour in COLOURS.items()}
@@ -73,7 +71,7 @@ def png_files(data: Reproduction) -> dict[str, bytes]:
     for name, plot in PLOTS.items():
         arms = tuple(arm for arm in plot.arms if arm in data.logs)
         if arms:
-            files[name] = drawing.png(plot.make(data, arms), SHADES)
+            files[name] = drawing.png(plot.make(data, arms))
     return files
 
 
@@ -135,38 +133,6 @@ def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) ->
     band = curve(shared[1], resamples=_RESAMPLES)
     place.fill_between(shared[0], band.low, band.high, color=colour, alpha=0.25, lw=0)
     place.plot(shared[0], band.estimate, lw=2.0, **_style(arm))
-
-
-def final(data: Reproduction, arms: tuple[str, ...]) -> Figure:
-    """Draws the results of the final policies on both stages: every seed, and intervals."""
-    figure = Figure(figsize=(drawing.WIDTH, 1.6 + 0.8 * len(arms)), layout="constrained")
-    places = figure.subplots(2, 2, sharey=True)
-    for place, (key, (label, unit)) in zip(places.flat, FINAL.items(), strict=False):
-        for shift, stage, mark in ((-0.16, LAST, "o"), (0.16, EXPANDED, "s")):
-            for row, arm in enumerate(arms):
-                _dots(place, data.judged[arm, stage][key], row + shift, (COLOURS[arm], mark))
-        drawing.dress(place, label, 9)
-        if unit is SHARE:
-            place.xaxis.set_major_formatter(drawing.percent())
-        place.set_xlim(left=max(0.0, place.get_xlim()[0]))
-    places[0, 0].set_yticks(range(len(arms)), arms)
-    places[0, 0].set_ylim(len(arms) - 0.5, -0.5)
-    marks = [
-        Line2D([], [], color="0.3", marker=mark, ls="-", label=f"on {stage}, IQM and 95 %")
-        for mark, stage in (("o", LAST), ("s", EXPANDED))
-    ]
-    marks.append(Line2D([], [], color="0.3", marker=".", ls="", ms=4, alpha=0.5, label="a seed"))
-    drawing.explain(figure, marks, 3)
-    return figure
-
-
-def _dots(place: Axes, values: np.ndarray, row: float, style: tuple[str, str]) -> None:
-    """Draws the seeds of an arm as dots, and their interquartile mean with its interval."""
-    colour, mark = style
-    mean = statistics.bootstrap(values[:, None], iqm)
-    place.plot(values, np.full(len(values), row + 0.11), ".", color=colour, ms=4, alpha=0.5)
-    place.hlines(row, mean.low, mean.high, color=colour, lw=2.0)
-    place.plot([mean.estimate], [row], mark, color=colour, ms=5)
 
 
 def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str | None) -> Figure:
@@ -274,7 +240,6 @@ PLOTS = {
     "figure8": Plot(PAIR, partial(curves, panels=_collisions(None) + _collisions(LAST))),
     "figure9_raster": Plot(TUNED, partial(raster, axis="episode", stage=EXPANDED)),
     "figure9_curves": Plot(TUNED, partial(curves, panels=_TO_THE_END)),
-    "final": Plot((*PAIR, *TUNED, *MODERN), final),
     "modern_curves": Plot(
         (*PAIR, *MODERN), partial(curves, panels=_DEFAULT_TRAINER, axes=("steps",))
     ),

@@ -4,24 +4,19 @@ Every policy drives by its mean action on the last stage and in the 1.5 m arena.
 only in their sensor noise.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from swarmjax import policy_file
 from swarmjax.config import build
-from swarmjax.evaluate import cells
-from swarmjax.evaluate import judge as evaluate_judge
+from swarmjax.evaluate import cells, engine_c
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.replay.record import Recording, record
 from swarmjax.report.rows import Row
 from swarmjax.run.load_settings import from_stored
 from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig
 
-_EQUATION_3 = ("progress", "proximity")  # the terms of the paper's reward
+EPISODES = 20  # on each stage
 
 
 class Task(NamedTuple):
@@ -33,15 +28,8 @@ class Task(NamedTuple):
     stage: str
 
 
-def judge(episodes: int, task: Task) -> Row:
-    """Judges one policy on one stage.
-
-    Args:
-      episodes: number of episodes.
-      task: the policy and the stage.
-
-    Returns:
-      A row of `evaluation.json`.
+def judge(task: Task) -> Row:
+    """Judges one policy on one stage; returns a row of `evaluation.json`.
 
     Raises:
       PolicyError: if the policy is invalid.
@@ -57,35 +45,16 @@ def judge(episodes: int, task: Task) -> Row:
         realism=config.realism,
         action="mean",
         steps=config.task.step_limit,
-        episodes=episodes,
+        episodes=EPISODES,
     )
-    levels = cells.split(cells.draw_stage(evaluation, range(episodes)).levels)
-    recordings = record(evaluate_judge.load(evaluation, trained), levels)
-    about = {"arm": task.arm, "seed": task.seed, "stage": task.stage, "episodes": episodes}
-    return about | measure(recordings, config.task.sensor_range)
-
-
-def measure(episodes: Sequence[Recording], sensor_range: float) -> dict[str, float]:
-    """Computes the means of a policy over its episodes.
-
-    Args:
-      episodes: episodes of the same number of robots.
-      sensor_range: range of the infrared sensors, m.
-    """
-    moving = np.concatenate([~each.arrived[:-1] for each in episodes])
-    near = np.concatenate([(each.ray[1:] < sensor_range).any(axis=-1) for each in episodes])
-    reached = np.array([each.arrived[-1] for each in episodes])
-    earned = sum(
-        float(each.reward[term].sum())
-        for each in episodes
-        for term in _EQUATION_3
-        if term in each.reward
-    )
+    levels = cells.split(cells.draw_stage(evaluation, range(EPISODES)).levels)
+    outcome = engine_c.simulate(engine_c.load(evaluation, trained), levels)
     return {
-        "targets_reached": float(reached.mean()),
-        "all_reached": float(reached.all(axis=-1).mean()),
-        "sensed_share": float((near & moving).sum() / moving.sum()),
-        "contacts_per_robot": float(np.mean([each.contacts[-1].sum(-1) for each in episodes])),
-        "steps": float(np.mean([len(each.pose) - 1 for each in episodes])),
-        "return": earned / reached.size,
+        "arm": task.arm,
+        "seed": task.seed,
+        "stage": task.stage,
+        "targets_reached": float(outcome.arrived.mean()),
+        "all_reached": float(outcome.arrived.all(axis=-1).mean()),
+        "sensed_share": float(outcome.sensed.sum() / outcome.moving.sum()),
+        "contacts_per_robot": float(outcome.contacts.sum(axis=-1).mean()),
     }

@@ -275,11 +275,10 @@ SHARE = Unit(lambda share: f"{100 * share:.1f}", " %", " points")
 # An episode number or arena steps; inf means never.
 PLACE = Unit(lambda place: "never" if math.isinf(place) else f"{place:,.0f}")
 NUMBER = Unit(lambda value: f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}")
-# What the table and the figure of final policies show of `JUDGED`.
+# What the table of final policies shows of `JUDGED`.
 FINAL: dict[str, tuple[str, Unit]] = {
     "targets_reached": ("targets reached", SHARE),
     "all_reached": ("episodes in which all arrived", SHARE),
     "sensed_share": ("steps within infrared range", SHARE),
     "contacts_per_robot": ("contacts per robot and episode", NUMBER),
-    "return": ("return per robot (m)", NUMBER),
 }

@@ -13,8 +13,8 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import builder
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.measures import FINAL, NUMBER, PLACE, Unit
-from swarmjax.reproduce.rows import ARMS, EXPANDED, LAST, MODERN, PAIR, Reproduction
+from swarmjax.reproduce.measures import FINAL, PLACE, Unit
+from swarmjax.reproduce.rows import ARMS, LAST, MODERN, PAIR, Reproduction
 
 PAGE, FIGURES = "report.html", "figures"
 # Both readings of success, over all episodes and over those on the last stage.
@@ -76,7 +76,6 @@ def _page(
         counts=", ".join(f"{outcomes.count(name)} {name}" for name in _OUTCOMES),
         held=claims.HELD,
         last=LAST,
-        expanded_stage=EXPANDED,
         figures=figures,
         lacks=lacks,
         final_heads=("arm", "on", *(label for label, _ in FINAL.values())),
@@ -87,11 +86,7 @@ def _page(
         window=measures.WINDOW,
         steady_share=100 * measures.STEADY,
         kept_share=100 * measures.KEPT,
-        seed_heads=[f"seed {seed}" for seed in data.seeds],
         steady=[(*case, *_summary(of_seeds)) for *case, of_seeds in places],
-        each_seed=[(*case, *map(PLACE.value, of_seeds)) for *case, of_seeds in places],
-        compared=[] if data.lacking(PAIR) else _compared(data),
-        goals=[claims.evaluate(data, goal) for goal in claims.GOALS],
     )
 
 
@@ -107,19 +102,3 @@ def _summary(places: np.ndarray) -> tuple[str, str, str]:
         # No bootstrap: if all ten seeds become steady, its interval would be 100 to 100 %.
         f"{np.isfinite(places).sum()} of {len(places)}",
     )
-
-
-def _compared(data: Reproduction) -> list[tuple[str, ...]]:
-    """Makes the table of how much earlier success becomes steady with the curriculum.
-
-    The table gives the difference of paired seeds, and the probability for unpaired ones.
-    """
-    rows = []
-    for goal, counted, values in _CASES:
-        ours, theirs = (values(data, arm)[:, None] for arm in PAIR)
-        paired = "a seed never gets there"
-        if np.isfinite([ours, theirs]).all():
-            paired = PLACE.difference(statistics.paired(theirs, ours, iqm))
-        chance = statistics.probability_of_improvement(theirs, ours)
-        rows.append((goal, counted, paired, NUMBER.interval(chance)))
-    return rows

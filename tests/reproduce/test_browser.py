@@ -53,7 +53,7 @@ def test_its_figures_are_shown(browser: Any, file: Path) -> None:
     _open(browser, file)
     script = "return [...document.images].map((i) => [i.complete, i.naturalWidth, i.offsetWidth])"
     found = browser.execute_script(script)
-    assert len(found) == len(list((file.parent / "figures").glob("*.png"))) == 7
+    assert len(found) == len(list((file.parent / "figures").glob("*.png"))) == 6
     for complete, natural, shown in found:
         assert complete
         assert natural == shown > 900

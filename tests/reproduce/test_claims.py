@@ -231,20 +231,3 @@ def test_every_claim_needs_arms_that_there_are() -> None:
         assert {arm for reading in claim.readings for arm in reading.arms} <= set(ARMS)
         names = [reading.name for reading in claim.readings]
         assert len(set(names)) == len(names)
-
-
-def test_goals_are_those_of_the_default_trainer() -> None:
-    shares = {
-        ("modern_curriculum", LAST): {"targets_reached": 0.95},
-        ("modern_curriculum", EXPANDED): {"targets_reached": 0.89},
-    }
-    data = reproduction(judged=shares)
-    met = {
-        each.reading: each.holds for each in (claims.evaluate(data, goal) for goal in claims.GOALS)
-    }
-    assert met == {
-        "modern_curriculum, at least 95 % of the targets on paper6": True,
-        "modern_curriculum, at least 90 % of the targets on paper_expanded": False,
-        "modern_baseline, at least 95 % of the targets on paper6": None,
-        "modern_baseline, at least 90 % of the targets on paper_expanded": None,
-    }

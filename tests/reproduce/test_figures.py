@@ -1,16 +1,12 @@
 """Tests what the figures of a reproduction show, read from their Matplotlib artists."""
 
-import io
 import math
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from PIL import Image
 from reproductions import log, reproduction, whole
 
-from swarmjax.pages import figures as drawing
 from swarmjax.reproduce import figures, measures
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.figures import columns, raster
@@ -93,14 +89,6 @@ def test_no_mean_is_drawn_where_a_seed_has_no_episodes() -> None:
     assert _curve(figure, 0, 2.0) == []
 
 
-def test_final_policies_have_their_seeds_and_intervals() -> None:
-    shares = {("baseline", LAST): {"targets_reached": 0.75}}
-    figure = figures.final(reproduction(judged=shares), ("baseline",))
-    seeds, mean = figure.axes[0].lines[:2]
-    assert np.asarray(seeds.get_xdata()).tolist() == [0.75] * 3
-    assert np.asarray(mean.get_xdata()).tolist() == [0.75]
-
-
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     out = whole(tmp_path_factory.mktemp("out"), episodes=25, arms=("curriculum",))
@@ -111,20 +99,3 @@ def test_figures_of_arms_that_have_not_finished_are_left_out(drawn: dict[str, by
     lacking = {"figure9_raster", "figure9_curves", "modern_raster"}
     assert set(drawn) == figures.PLOTS.keys() - lacking
     assert all(png.startswith(b"\x89PNG") for png in drawn.values())
-
-
-def test_arms_keep_their_colours_in_the_file() -> None:
-    # The palette of few colours must keep the arms' colours apart, even for short lines.
-    random = np.random.default_rng(0)
-    arms = (*PAIR, "modern_curriculum", "modern_baseline")
-    logs = {}
-    for i, arm in enumerate(arms, 1):
-        stage = np.array(["paper1"] * (0 if "baseline" in arm else 350) + [LAST] * 400)[:400]
-        share = 0.97 if "curriculum" in arm else 0.2 * i
-        logs[arm] = [log(random.random(400) < share, stage=stage) for _ in range(3)]
-    png = drawing.png(figures.PLOTS["modern_curves"].make(reproduction(logs), arms), figures.SHADES)
-    image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float).reshape(-1, 3)
-    for arm in arms:
-        colour = 255 * np.array(to_rgb(figures.COLOURS[arm]))
-        # The palette's colours are off by up to 9 of 255 here. The median cut's are off by 48.
-        assert np.abs(image - colour).max(axis=1).min() <= 12, arm
