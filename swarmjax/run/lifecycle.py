@@ -370,7 +370,6 @@ def _opening(program: Built) -> str:
     steps, every = settings.arenas * settings.algo.rollout_length, seeds.numbers(settings)
     how = {
         "vmap": "side by side",
-        "map": "in turn",
         "cores": "spread over cores",
         "devices": "spread over devices",
     }[settings.seeds_by]

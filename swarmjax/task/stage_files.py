@@ -53,10 +53,10 @@ def read_stage(choice: str) -> dict[str, Any]:
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
     """
-    files.check_choice("stage", choice, "stage")
-    if _is_sequence(choice) or _is_grid(choice):
+    found = files.read_choice("stage", choice)
+    if {"sequence", "grid"} & found.keys():
         raise ConfigError(f"stage is {choice}, which names several stages: give single stages.")
-    return _named(files.read_choice("stage", choice), choice)
+    return _named(found, choice)
 
 
 def load_levels[C: Section](
@@ -137,12 +137,11 @@ def _refuse_others(stage: dict[str, Any], choice: str, only: str, advice: str) -
 
 def _member(name: str) -> dict[str, Any]:
     """Reads one stage of a curriculum."""
-    files.check_choice("stage", name, "stage.sequence")
-    if _is_sequence(name):
-        raise ConfigError(f"stage.sequence names {name}, a curriculum itself: give single stages.")
-    if _is_grid(name):
-        raise ConfigError(f"stage.sequence names {name}, a grid: give single stages.")
-    return _named(files.read_choice("stage", name), name)
+    found = files.read_choice("stage", name, "stage.sequence")
+    for key, what in (("sequence", "a curriculum itself"), ("grid", "a grid")):
+        if key in found:
+            raise ConfigError(f"stage.sequence names {name}, {what}: give single stages.")
+    return _named(found, name)
 
 
 def name_of(choice: str) -> str:
