@@ -44,11 +44,9 @@ def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any
     first, typed = defaults(cls.command), {k: choice for k, choice in flat.items() if choices(k)}
     by_whole, values = _read_whole(cls, (first | typed).get(_WHOLE))
     chosen = first | by_whole | typed
-    found: dict[str, Any] = {}
-    for group, choice in chosen.items():
-        check_choice(group, choice, group)
-        if group != _WHOLE:
-            found[group] = read_choice(group, choice)
+    found = {
+        group: read_choice(group, choice) for group, choice in chosen.items() if group != _WHOLE
+    }
     others = nest({key: value for key, value in flat.items() if key not in typed})
     return merge(merge(found, values), others), chosen
 
@@ -57,7 +55,6 @@ def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str],
     """Reads the choices and values of a file of the group that may set keys of all sections."""
     if choice is None:
         return {}, {}
-    check_choice(_WHOLE, choice, _WHOLE)
     found = read_choice(_WHOLE, choice)
     if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
         found = {_WHOLE: found}
@@ -202,20 +199,18 @@ def read_file(name: str) -> dict[str, Any]:
     return read_yaml(_config_dir() / f"{name}.yaml")
 
 
-def read_choice(group: str, choice: str) -> dict[str, Any]:
+def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, Any]:
     """Reads the file that the choice of a group names.
 
     Args:
       group: a folder of configs/.
       choice: the name of a file in that folder, or the path of another file.
+      key: name of the setting in messages; None: that of the group.
 
     Raises:
-      ConfigError: if the file cannot be read.
+      ConfigError: if there is no such file, or it cannot be read.
     """
-    if not is_path(choice):
-        return read_file(f"{group}/{choice}")
-    check_text(group, choice)
-    return read_yaml(Path(choice))
+    return read_yaml(named_path(group, choice, key or group))
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -234,16 +229,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return mapping
 
 
-def read_preset(group: str, choice: str) -> dict[str, Any]:
-    """Reads a preset, which is one file of a group, such as `real` of the group `realism`.
-
-    Raises:
-      ConfigError: if there is no such file.
-    """
-    check_choice(group, choice, group)
-    return read_file(f"{group}/{choice}")
-
-
 def preset_of(group: str, held: Section) -> str:
     """Returns the name of the preset whose values a section has; `custom` if no preset has them."""
     derived = section.keys(type(held), derived=True)
@@ -252,7 +237,7 @@ def preset_of(group: str, held: Section) -> str:
         return {key: value for key, value in section.to_dict(of).items() if key not in derived}
 
     for name in choices(group):
-        if numbers(section.build(type(held), read_preset(group, name))) == numbers(held):
+        if numbers(section.build(type(held), read_choice(group, name))) == numbers(held):
             return name
     return "custom"
 
@@ -261,46 +246,26 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     """Returns the file that a choice names: one of a folder of configs/, or a user's own.
 
     Args:
-      folder: a folder of configs/ that is not a group of a command.
-      choice: the name of a file in that folder, or the path of another file.
-      key: name of the setting in messages.
-
-    Raises:
-      ConfigError: if there is no such name.
-    """
-    check_text(key, choice)
-    if is_path(choice):
-        return Path(choice)
-    check_choice(folder, choice, key)
-    return _config_dir() / folder / f"{choice}.yaml"
-
-
-def _example(group: str) -> str:
-    return f"{group}={choices(group)[-1]}"
-
-
-def check_choice(group: str, choice: str, key: str) -> None:
-    """Refuses a choice that is not a file of a group.
-
-    Args:
-      group: a folder of configs/.
+      folder: a folder of configs/.
       choice: the name of a file in that folder, or the path of another file.
       key: name of the setting in messages.
 
     Raises:
       ConfigError: if there is no such file.
     """
-    names = choices(group)
+    check_text(key, choice)
     if is_path(choice):
-        check_text(key, choice)
         if not Path(choice).exists():
             raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
-    elif choice not in names:
+        return Path(choice)
+    names = choices(folder)
+    if choice not in names:
         # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
         hint = f" (nearest: {near[0]})" if near else ""
-        file = ", or a file .yaml" if group in _OWN_FILES else ""
+        file = ", or a file .yaml" if folder in _OWN_FILES else ""
         raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}{file}.")
+    return _config_dir() / folder / f"{choice}.yaml"
 
 
 # Words
@@ -330,7 +295,8 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
         if root not in section.names(cls):
             raise section.unknown_key(root, cls)
         if key in derived:
-            raise ConfigError(f"{key} cannot be given: choose a file, as in {_example(root)}.")
+            advice = [f": choose a file, as in {root}={name}" for name in choices(root)[-1:]]
+            raise ConfigError(f"{key} cannot be given{''.join(advice)}.")
         if choices(key):
             check_text(key, value)
             found[key] = value.strip("'\"")

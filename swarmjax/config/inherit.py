@@ -52,7 +52,7 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
     """
     if group in files.parse(cls, typed):
         return []
-    preset = section.build(type(held), files.read_preset(group, held.name))
+    preset = section.build(type(held), files.read_choice(group, held.name))
     found = _differences(section.to_dict(held), section.to_dict(preset))
     return [
         f"{group}={held.name}",

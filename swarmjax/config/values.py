@@ -104,7 +104,7 @@ def check_text(key: str, text: str) -> None:
       text: a path, a name, or several separated by commas.
 
     Raises:
-      ConfigError: if the text has a control character, a name too long for a file, or bad Unicode.
+      ConfigError: if the text has a control character, too long a name, or no valid Unicode.
     """
     if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
         raise ConfigError(f"{key} is {show(text)}: give text without control characters.")

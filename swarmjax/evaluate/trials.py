@@ -123,7 +123,7 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     """
     realism = config.realism
     if cell.realism is not None:
-        realism = build(RealismConfig, files.read_preset("realism", cell.realism))
+        realism = build(RealismConfig, files.read_choice("realism", cell.realism))
     robot = config.robot
     if cell.hull_friction is not None:
         robot = replace(robot, hull_friction=cell.hull_friction)

@@ -158,7 +158,7 @@ class TrainConfig(ProgramConfig):
             )
         if self.devices > 1 and self.seeds_by == "cores":
             raise ConfigError(
-                f"seeds_by is cores, but devices is {self.devices}: give vmap, map or devices, or "
+                f"seeds_by is cores, but devices is {self.devices}: give vmap or devices, or "
                 "devices=1."
             )
         if self.seeds_by == "devices" and self.seeds % self.devices:

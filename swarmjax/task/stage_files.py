@@ -62,8 +62,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
     """
-    files.check_choice("stage", choice, key)
-    if _several(choice):
+    if _several(choice, key):
         raise ConfigError(f"{key} is {choice}, which names several stages: give single stages.")
     return _named(files.read_choice("stage", choice), choice)
 
@@ -107,10 +106,10 @@ def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[st
             )
 
 
-def _several(choice: str) -> str | None:
+def _several(choice: str, key: str = "stage") -> str | None:
     """Returns the key of `_SEVERAL` that a file of configs/stage/ has, if it has one."""
-    found = files.read_choice("stage", choice)
-    return next((key for key in _SEVERAL if key in found), None)
+    stage = files.read_choice("stage", choice, key)
+    return next((several for several in _SEVERAL if several in stage), None)
 
 
 def _sequence(stages: Any, choice: str) -> list[dict[str, Any]]:

@@ -38,12 +38,11 @@ class ProgramConfig(Section):
             "a second run, with seed=4096",
         ),
     )
-    seeds_by: Literal["vmap", "map", "cores", "devices"] = field(
+    seeds_by: Literal["vmap", "cores", "devices"] = field(
         default="vmap",
         metadata=about(
-            "how to train the seeds; vmap: side by side; map: one after the other, bit for bit as "
-            "in a run of one seed; cores: vmap, in a group for each core of a CPU; devices: vmap, "
-            "in a group for each device"
+            "how to train the seeds; vmap: side by side; cores: vmap, in a group for each core of "
+            "a CPU; devices: vmap, in a group for each device"
         ),
     )
     arenas: int = field(

@@ -157,7 +157,5 @@ def groups(config: ProgramConfig, cores: int) -> int:
 
 def side_by_side(config: ProgramConfig) -> int:
     """Returns how many seeds one call of the program steps at once on a device."""
-    if config.seeds_by == "map":
-        return 1
     parts = config.devices if config.seeds_by == "devices" else groups(config, cores())
     return config.seeds // parts

@@ -42,7 +42,7 @@ def init(
       [N] states before the first update.
     """
     lanes = np.array(numbers(program.config), np.uint32) if lanes is None else lanes
-    return each(program.config, partial(loop.init, program, schedule), lanes)
+    return each(partial(loop.init, program, schedule), lanes)
 
 
 def train_chunk(
@@ -59,27 +59,23 @@ def train_chunk(
     Returns:
       [N] states after, and metrics [N, rows, ...]: the first n rows hold one update each.
     """
-    return each(program.config, lambda lane: loop.train_chunk(program, schedule, lane, n), state)
+    return each(lambda lane: loop.train_chunk(program, schedule, lane, n), state)
 
 
-def each(config: ProgramConfig, function: Callable[[Any], Any], lanes: Any) -> Any:
-    """Applies a function of one seed to all seeds, as `config.seeds_by` says.
+def each(function: Callable[[Any], Any], lanes: Any) -> Any:
+    """Applies a function of one seed to all seeds of a call, side by side.
 
-    Side by side (`vmap`), the matrix products are batched. This rounds differently from a run of
-    one seed, but in the same way for every seed. One seed alone is not batched. One after the other
-    (`map`), a seed gives the same bits for any number of seeds. With `cores`, a call has one group
-    of seeds, which run side by side. With `devices`, the seeds of each device run side by side.
+    The matrix products are then batched. This rounds differently from a run of one seed, but in the
+    same way for every seed. One seed alone is not batched. With `seeds_by=cores`, a call has one
+    group of seeds; with `devices`, it has the seeds of one device.
 
     Args:
-      config: settings of the run.
       function: from a tree to a tree.
       lanes: the function's arguments with a leading axis N.
 
     Returns:
       The function's results with a leading axis N.
     """
-    if config.seeds_by == "map":
-        return jax.lax.map(function, lanes)
     if jax.tree.leaves(lanes)[0].shape[0] == 1:
         alone = function(jax.tree.map(lambda x: x[0], lanes))
         return jax.tree.map(lambda x: x[None], alone)

@@ -258,7 +258,7 @@ def test_a_suite_and_several_policies_fill_a_folder(
     assert [each["path"][-9:] for each in result["policies"]] == [f"seed{i}.npz" for i in range(3)]
     assert [cell["cell"] for cell in result["cells"]] == ["one", "two"]
     assert [cell["realism"]["name"] for cell in result["cells"]] == ["ideal", "webots"]
-    preset = build(RealismConfig, files.read_preset("realism", "webots"))
+    preset = build(RealismConfig, files.read_choice("realism", "webots"))
     assert result["cells"][1]["realism"] == _plain(preset)
     with (out / "levels.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -37,7 +37,7 @@ def test_hull_sensors_task_realism_and_stage_are_those_of_training(odd: str) -> 
     found = _load(odd)
     assert (found.robot.hull_radius, found.stage.name) == (0.044, "s3")
     assert (found.task.sensor_range, found.task.control_step) == (0.1, 0.016)
-    real = build(RealismConfig, files.read_preset("realism", "real"))
+    real = build(RealismConfig, files.read_choice("realism", "real"))
     assert found.realism == replace(real, mass=None)
 
 

@@ -53,7 +53,7 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 
 
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
-    given = files.read_preset("algo", "paper")
+    given = files.read_choice("algo", "paper")
     of_gae = {"gae_lambda", "normalize_advantages"}
     of_others = {"memory_size", "guess_cost"}  # of a memory, and of a critic of the state
     others = of_gae | of_others | {"update_backend", "network"}  # for speed or extensions

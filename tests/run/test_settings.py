@@ -254,7 +254,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
         (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
          "may be at most 2147483647: give at most 2147483646."),
-        (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, map, cores or devices."),
+        (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, cores or devices."),
         (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
          "4096 control steps: give at least 4096."),

@@ -25,10 +25,8 @@ SEEDS, UPDATES = 3, np.int32(2)
 Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
 
 
-def _program(
-    config: TrainConfig, world: World, count: int, by: Literal["vmap", "map"], first: int = 0
-) -> Program:
-    return programs.build(replace(config, seed=first, seeds=count, seeds_by=by), world)
+def _program(config: TrainConfig, world: World, count: int, first: int = 0) -> Program:
+    return programs.build(replace(config, seed=first, seeds=count), world)
 
 
 def _start(program: Program) -> TrainState:
@@ -41,7 +39,7 @@ def _run(program: Program) -> Run:
 
 @pytest.fixture(scope="module")
 def side_by_side(tiny_config: TrainConfig, tiny_world: World) -> Program:
-    return _program(tiny_config, tiny_world, SEEDS, "vmap")
+    return _program(tiny_config, tiny_world, SEEDS)
 
 
 @pytest.fixture(scope="module")
@@ -110,26 +108,16 @@ def test_a_broken_seed_leaves_the_others_alone(start: TrainState, run: Run) -> N
 def test_a_seed_begins_alike_wherever_it_stands(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState
 ) -> None:
-    later = _start(_program(tiny_config, tiny_world, SEEDS, "vmap", first=1))
+    later = _start(_program(tiny_config, tiny_world, SEEDS, first=1))
     for lane in (0, 1):
         _assert_same(_lane((later, {}), lane), _lane((start, {}), lane + 1))
-
-
-@pytest.mark.slow
-def test_in_turn_a_seed_is_the_run_that_it_is_alone(
-    tiny_config: TrainConfig, tiny_world: World
-) -> None:
-    together = _program(tiny_config, tiny_world, SEEDS, "map")
-    found = _run(together)(_start(together), UPDATES)
-    alone = _program(tiny_config, tiny_world, 1, "map", first=1)
-    _assert_same(_lane(found, 1), _lane(_run(alone)(_start(alone), UPDATES), 0))
 
 
 @pytest.mark.slow
 def test_one_seed_is_what_the_loop_makes(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState, run: Run
 ) -> None:
-    program = _program(tiny_config, tiny_world, 1, "vmap", first=1)
+    program = _program(tiny_config, tiny_world, 1, first=1)
     schedule = programs.schedule(program.config)
     first = _start(program)
     plain = jax.jit(partial(loop.init, program))(schedule)
@@ -179,17 +167,13 @@ def test_what_is_stepped_together_lies_on_one_axis(
     held = np.asarray(start.arenas.sim.qpos)
     assert held.shape[:2] == (SEEDS, tiny_config.arenas)
     np.testing.assert_array_equal(flat, np.concatenate(list(held)))
-    in_turn = _program(tiny_config, tiny_world, SEEDS, "map")
-    np.testing.assert_array_equal(seeds.stepped_together(in_turn, start).qpos, held[0])
 
 
-@pytest.mark.parametrize(("by", "arenas"), [("vmap", 8 * 3), ("map", 8)])
-def test_warp_has_room_for_the_arenas_that_are_stepped_together(
-    by: Literal["vmap", "map"], arenas: int, tiny_config: TrainConfig
-) -> None:
+def test_warp_has_room_for_the_arenas_that_are_stepped_together(tiny_config: TrainConfig) -> None:
+    arenas = tiny_config.arenas * SEEDS
     sim = replace(tiny_config.sim, impl="warp", solver="mjx")
     warp = replace(tiny_config, sim=sim)
-    several = programs.load_world(replace(warp, seeds=SEEDS, seeds_by=by)).physics.engine.template
+    several = programs.load_world(replace(warp, seeds=SEEDS)).physics.engine.template
     expected = programs.load_world(replace(warp, arenas=arenas)).physics.engine.template
     assert several._impl.naconmax == expected._impl.naconmax
     assert several._impl.naconmax >= arenas
@@ -211,11 +195,11 @@ def test_warp_has_room_for_seeds_of_one_group_on_one_core(
 
 @pytest.mark.parametrize(
     ("by", "cores", "backend", "expected"),
-    [("map", 2, "cpu", 1), ("vmap", 2, "cpu", 6), ("cores", 1, "cpu", 6), ("cores", 2, "cpu", 3),
+    [("vmap", 2, "cpu", 6), ("cores", 1, "cpu", 6), ("cores", 2, "cpu", 3),
      ("cores", 4, "cpu", 2), ("cores", 16, "cpu", 1), ("cores", 2, "gpu", 6)],
 )  # fmt: skip
 def test_a_call_steps_the_seeds_of_a_group_side_by_side(
-    by: Literal["vmap", "map", "cores"], cores: int, backend: str, expected: int,
+    by: Literal["vmap", "cores"], cores: int, backend: str, expected: int,
     tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setattr(programs, "cores", lambda: cores)
@@ -223,13 +207,10 @@ def test_a_call_steps_the_seeds_of_a_group_side_by_side(
     assert programs.side_by_side(replace(tiny_config, seeds=6, seeds_by=by)) == expected
 
 
-@pytest.mark.parametrize(("by", "learners"), [("vmap", 18), ("map", 3)])
-def test_networks_know_how_many_learners_train_side_by_side(
-    by: Literal["vmap", "map"], learners: int, tiny_config: TrainConfig
-) -> None:
+def test_networks_know_how_many_learners_train_side_by_side(tiny_config: TrainConfig) -> None:
     algo = replace(tiny_config.algo, policy="independent")  # one for each of three robots
-    config = replace(tiny_config, seeds=6, seeds_by=by, algo=algo)
-    assert programs.load(config)[0].ppo.learning.side_by_side == learners
+    config = replace(tiny_config, seeds=6, algo=algo)
+    assert programs.load(config)[0].ppo.learning.side_by_side == 18
 
 
 def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
@@ -268,10 +249,10 @@ def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
 @pytest.mark.parametrize(
     ("count", "cores", "by", "expected"),
     [(10, 2, "cores", 2), (10, 4, "cores", 2), (10, 16, "cores", 10), (7, 4, "cores", 1),
-     (1, 8, "cores", 1), (10, 2, "vmap", 1), (10, 2, "map", 1)],
+     (1, 8, "cores", 1), (10, 2, "vmap", 1)],
 )  # fmt: skip
 def test_cores_have_as_many_seeds_each(
-    count: int, cores: int, by: Literal["vmap", "map", "cores"], expected: int,
+    count: int, cores: int, by: Literal["vmap", "cores"], expected: int,
     tiny_config: TrainConfig,
 ) -> None:  # fmt: skip
     assert programs.groups(replace(tiny_config, seeds=count, seeds_by=by), cores) == expected
