@@ -13,7 +13,7 @@ from entries import DISTANCE, INFRARED
 
 from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.engine import Next
-from swarmjax.ppo import batch, gae
+from swarmjax.ppo import batch
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY
@@ -200,7 +200,7 @@ def _random_trajectory(shape: tuple[int, int, int, int]) -> Trajectory:
 def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
     shape = (5, count, 4, robots)
     trajectory = _random_trajectory(shape)
-    advantage, return_ = gae.generalized_advantages(
+    advantage, return_ = batch.generalized_advantages(
         *trajectory[5:6],
         *trajectory[3:5],
         *trajectory[6:8],
