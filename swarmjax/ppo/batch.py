@@ -54,9 +54,8 @@ class Batch:
       observation: [G, N, O], raw.
       action: [G, N, U], as drawn.
       log_prob: [G, N], of the action under the policy that drew it.
-      advantage: [G, N]. With `config.normalize_advantages`, the update normalises the advantages
-        over the valid samples, unless the advantages come from Monte-Carlo returns, which are
-        normalised already.
+      advantage: [G, N]. The update normalises the advantages over the valid samples, unless they
+        come from Monte-Carlo returns, which are normalised already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; () each without
@@ -150,14 +149,11 @@ def _bootstrapped(
     trajectory: Trajectory, config: AlgoConfig, _: Shards
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the advantages and returns of generalised advantage estimation."""
-    terminated = trajectory.terminated
-    if config.time_out == "terminal":
-        terminated = terminated | _timed_out(trajectory)
     return generalized_advantages(
         trajectory.reward,
         trajectory.value,
         trajectory.next_value,
-        terminated,
+        trajectory.terminated,
         trajectory.truncated,
         discount=config.discount,
         gae_lambda=config.gae_lambda,
@@ -169,16 +165,9 @@ def _monte_carlo(
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
     boundary = trajectory.terminated | trajectory.truncated
-    if config.time_out == "leak":
-        boundary = boundary & ~_timed_out(trajectory)
     returns = monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
     normal = normalize_returns(returns, trajectory.valid, shards)
     return normal - trajectory.value, normal
-
-
-def _timed_out(trajectory: Trajectory) -> jax.Array:
-    """Tells where the step limit ended episodes. Steps whose physics broke are not valid."""
-    return trajectory.truncated & trajectory.valid
 
 
 def generalized_advantages(

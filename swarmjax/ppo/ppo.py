@@ -278,7 +278,7 @@ def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
 def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
     """Prepares samples for the loss, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
-    if config.advantage == "gae" and config.normalize_advantages:
+    if config.advantage == "gae":
         advantage = _normalize_advantages(advantage, valid, shards)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),

@@ -107,7 +107,7 @@ def compile_chunk(
     state: Any,
     meanwhile: Callable[[], None] | None = None,
 ) -> Compiled:
-    """Compiles `seeds.train_chunk` ahead of time.
+    """Compiles `seeds.chunk` ahead of time.
 
     Args:
       program: the run's program.

@@ -82,7 +82,7 @@ def carry(source: Source, state: TrainState, settings: TrainConfig) -> TrainStat
 
     Args:
       source: the learned state, as `read` gave it.
-      state: the first state, as `seeds.init` gave it.
+      state: the first state, as `mesh.init` gave it.
       settings: the config of the new run. `init_from_std` selects the exploration to start with.
 
     Returns:

@@ -18,8 +18,8 @@ from swarmjax.run.checkpoint import CheckpointError, Checkpoints, digest
 from swarmjax.run.load_settings import load_train, read_config
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.warm_start import Source
+from swarmjax.training import mesh
 from swarmjax.training import program as programs
-from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 UPDATES = 3
@@ -74,7 +74,8 @@ def _load(words: list[str]) -> tuple[Source, TrainState, TrainConfig]:
     settings = load_train([*TINY, *words])
     source = warm_start.read(settings)
     assert source is not None
-    return source, seeds.init(*programs.load(settings)), settings
+    program, schedule = programs.load(settings)
+    return source, mesh.init(program)(schedule), settings
 
 
 def _rows(run: Path) -> list[dict]:

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -17,7 +16,7 @@ from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 from swarmjax.task.episode import Ended, Robots
-from swarmjax.training import episodes, seeds
+from swarmjax.training import episodes, mesh
 from swarmjax.training import program as programs
 
 
@@ -113,7 +112,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         run=replace(tiny_config.run, episodes=True, tensorboard=False),
     )
     program, schedule = programs.load(base, by_robot=True)
-    init = jax.jit(partial(seeds.init, program))
+    init = jax.jit(mesh.init(program))
     compiled = trainer.compile_chunk(program, schedule, init(schedule))
 
     def train_for(run: Path, updates: int, *, resume: bool = False) -> None:
