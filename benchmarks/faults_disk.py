@@ -234,7 +234,7 @@ def stand(stage: str) -> Stand:
     budget = f"budget={ARENAS * ROLLOUT * UPDATES}"
     config = load_train([*words, budget, "algo.hidden_sizes=[16]", "sim.impl=jax"])
     program, schedule = programs.load(config)
-    call = jax.jit(partial(seeds.train_chunk, program))
+    call = jax.jit(seeds.chunk(program))
     begin = jax.jit(partial(loop.init, program))
 
     def begin_seed(seed: int) -> TrainState:

@@ -37,8 +37,8 @@ from swarmjax.sim import dispatch, drive, physics
 from swarmjax.sim.config import physics_substeps
 from swarmjax.task import env
 from swarmjax.task.env import EnvState
+from swarmjax.training import mesh, rollout, seeds
 from swarmjax.training import program as programs
-from swarmjax.training import rollout, seeds
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
 
@@ -80,10 +80,10 @@ class Prepared:
 def prepare(settings: TrainConfig) -> Prepared:
     """Compiles all programs of one size; threads may prepare several sizes in parallel."""
     program, schedule = programs.load(settings)
-    init = partial(seeds.init, program)
+    init = mesh.init(program)
     template: TrainState = jax.eval_shape(init, schedule)
     keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
-    train = partial(seeds.train_chunk, program, schedule)
+    train = partial(seeds.chunk(program), schedule)
     environments, arenas = partial(_environments, program), template.arenas
     return Prepared(
         program=program,
@@ -297,7 +297,7 @@ def sweep(points: Sequence[TrainConfig]) -> Iterator[list[dict[str, Any]]]:
 
 def _physics(program: Program, arenas: EnvState, keys: Array) -> tuple[EnvState, Array]:
     """Runs `physics_alone` for all seeds."""
-    return seeds.each(program.config, lambda lane: physics_alone(program, *lane), (arenas, keys))
+    return seeds.each(lambda _, lane: physics_alone(program, *lane), None, (arenas, keys))
 
 
 def _environments(
@@ -306,7 +306,7 @@ def _environments(
     """Runs `environment` for all seeds."""
     schedule, keys = argument
     step = partial(environment, program, schedule)
-    return seeds.each(program.config, lambda lane: step(*lane), (arenas, keys))
+    return seeds.each(lambda _, lane: step(*lane), None, (arenas, keys))
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -6,14 +6,16 @@ arena's samples form a group, which minibatches do not split.
 
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from swarmjax.ppo import gae, monte_carlo
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.shards import ALONE, Shards
+
+_EPSILON = 1e-7  # as in PPO-PyTorch
 
 
 class Trajectory(NamedTuple):
@@ -52,9 +54,8 @@ class Batch:
       observation: [G, N, O], raw.
       action: [G, N, U], as drawn.
       log_prob: [G, N], of the action under the policy that drew it.
-      advantage: [G, N]. With `config.normalize_advantages`, the update normalises the advantages
-        over the valid samples, unless the advantages come from Monte-Carlo returns, which are
-        normalised already.
+      advantage: [G, N]. The update normalises the advantages over the valid samples, unless they
+        come from Monte-Carlo returns, which are normalised already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; () each without
@@ -148,14 +149,11 @@ def _bootstrapped(
     trajectory: Trajectory, config: AlgoConfig, _: Shards
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the advantages and returns of generalised advantage estimation."""
-    terminated = trajectory.terminated
-    if config.time_out == "terminal":
-        terminated = terminated | _timed_out(trajectory)
-    return gae.generalized_advantages(
+    return generalized_advantages(
         trajectory.reward,
         trajectory.value,
         trajectory.next_value,
-        terminated,
+        trajectory.terminated,
         trajectory.truncated,
         discount=config.discount,
         gae_lambda=config.gae_lambda,
@@ -167,13 +165,106 @@ def _monte_carlo(
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
     boundary = trajectory.terminated | trajectory.truncated
-    if config.time_out == "leak":
-        boundary = boundary & ~_timed_out(trajectory)
-    returns = monte_carlo.monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
-    normal = monte_carlo.normalize(returns, trajectory.valid, shards)
+    returns = monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
+    normal = normalize_returns(returns, trajectory.valid, shards)
     return normal - trajectory.value, normal
 
 
-def _timed_out(trajectory: Trajectory) -> jax.Array:
-    """Tells where the step limit ended episodes. Steps whose physics broke are not valid."""
-    return trajectory.truncated & trajectory.valid
+def generalized_advantages(
+    rewards: jax.Array,
+    values: jax.Array,
+    next_values: jax.Array,
+    terminated: jax.Array,
+    truncated: jax.Array,
+    *,
+    discount: float,
+    gae_lambda: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Computes advantages and returns of a rollout, time first.
+
+    Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
+    Estimation", equation 16. The sum is cut at the end of each episode and of the rollout. Values
+    after an end, NaN included, never affect steps before it.
+
+    Args:
+      rewards: [T, ...], reward of step t.
+      values: [T, ...], value of the observation before step t.
+      next_values: [T, ...], value of the observation after step t, before any reset; ignored
+        where `terminated`.
+      terminated: [T, ...], bool: the task ended here and nothing more can be earned.
+      truncated: [T, ...], bool: the episode was cut here and would have gone on.
+      discount: Per step, 0..1.
+      gae_lambda: 0 (one-step temporal difference) .. 1 (Monte Carlo).
+
+    Returns:
+      The advantages and the returns (advantage plus value), both [T, ...].
+    """
+    chex.assert_equal_shape([rewards, values, next_values, terminated, truncated])
+    terminated = terminated.astype(bool)
+    ends = terminated | truncated.astype(bool)
+    errors = rewards + discount * jnp.where(terminated, 0.0, next_values) - values
+
+    def accumulate(
+        following: jax.Array, step: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        error, end = step
+        advantage = error + discount * gae_lambda * jnp.where(end, 0.0, following)
+        return advantage, advantage
+
+    _, advantages = jax.lax.scan(
+        accumulate, jnp.zeros_like(errors[0]), (errors, ends), reverse=True
+    )
+    return advantages, advantages + values
+
+
+def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: float) -> jax.Array:
+    """Sums the discounted rewards from each step to the next boundary, time first.
+
+    As in PPO-PyTorch (nikhilbarhate99, commit 728cce8, `PPO.update`).
+
+    Nothing is bootstrapped: the sum ends at a boundary and at the end of the rollout, as if no more
+    rewards followed. If an episode ends without a boundary, the return goes on into the next
+    episode.
+
+    Args:
+      reward: [T, ...], reward of step t.
+      boundary: [T, ...], bool: the return of step t ends with the reward of this step.
+      discount: Per step, 0..1.
+
+    Returns:
+      The returns, [T, ...].
+    """
+    chex.assert_equal_shape([reward, boundary])
+
+    def accumulate(
+        following: jax.Array, step: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        earned, end = step
+        total = earned + discount * jnp.where(end, 0.0, following)
+        return total, total
+
+    _, returns = jax.lax.scan(
+        accumulate, jnp.zeros_like(reward[0]), (reward, boundary.astype(bool)), reverse=True
+    )
+    return returns
+
+
+def normalize_returns(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> jax.Array:
+    """Shifts and scales returns to mean 0 and deviation 1 over the valid samples.
+
+    The deviation is the unbiased one, which divides by N - 1, plus 1e-7.
+
+    Args:
+      returns: [...].
+      valid: [...], bool or 0/1.
+      shards: How the samples are spread over devices.
+
+    Returns:
+      The normalised returns, [...], including those that are not valid.
+    """
+    chex.assert_equal_shape([returns, valid])
+    valid = valid.astype(bool)
+    count = shards.sum(jnp.sum(valid))
+    mean = shards.sum(jnp.sum(jnp.where(valid, returns, 0.0))) / jnp.maximum(count, 1)
+    squares = shards.sum(jnp.sum(jnp.where(valid, (returns - mean) ** 2, 0.0)))
+    return (returns - mean) / (jnp.sqrt(squares / jnp.maximum(count - 1, 1)) + _EPSILON)

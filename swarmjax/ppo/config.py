@@ -12,7 +12,6 @@ from swarmjax.extension import Network
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     "gae_lambda": ("advantage", ("gae",)),
     "memory_size": ("memory", ("gru",)),
-    "guess_cost": ("critic", ("state",)),
     "std_decrement": ("exploration", ("scheduled",)),
     "std_interval": ("exploration", ("scheduled",)),
     "std_floor": ("exploration", ("scheduled",)),
@@ -22,9 +21,6 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 # Fewest control steps of a rollout that train a memory: a quarter of a second, in which a robot
 # drives about as far as it sees.
 LEAST_SEQUENCE = 8
-
-# How a return may treat the step limit.
-_TIME_OUTS = {"gae": ("bootstrap", "terminal"), "monte_carlo": ("terminal", "leak")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,23 +94,12 @@ class AlgoConfig(Section):
     advantage: Literal["gae", "monte_carlo"] = field(
         default="gae",
         metadata=about(
-            "gae: bootstrapped; monte_carlo: returns to the end of the episode or rollout, "
-            "normalised, for both critic and advantages"
+            "gae: bootstrapped, also at the step limit; monte_carlo: returns to the end of the "
+            "episode or rollout, normalised, for both critic and advantages"
         ),
     )
     gae_lambda: float = field(
         default=0.95, metadata=about("GAE's lambda [advantage=gae]", 0.0, 1.0)
-    )
-    normalize_advantages: bool = field(
-        default=True,
-        metadata=about("scale gae's advantages to mean 0 and deviation 1 over the rollout"),
-    )
-    time_out: Literal["bootstrap", "terminal", "leak"] = field(
-        default="bootstrap",
-        metadata=about(
-            "the return at the step limit; bootstrap: adds the critic's value [gae]; terminal: "
-            "ends; leak: goes on into the next episode [monte_carlo]"
-        ),
     )
     clip_epsilon: float = field(
         default=0.2,
@@ -152,14 +137,6 @@ class AlgoConfig(Section):
         default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
     )
     entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
-    guess_cost: float = field(
-        default=0.02,
-        metadata=about(
-            "weight of the squared error of the policy's guess of the state that the critic sees "
-            "[critic=state]",
-            0.0,
-        ),
-    )
     bound_cost: float = field(
         default=1500.0,
         metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
@@ -209,9 +186,12 @@ class AlgoConfig(Section):
         if not self.hidden_sizes:
             raise ConfigError("hidden_sizes is []: give at least one layer, as in [64,64].")
         check_options(self, _READ_BY)
-        self._check_time_out()
         self._check_memory()
-        self._check_critic()
+        if self.critic == "state" and self.update_backend == "fused":
+            raise ConfigError(
+                "update_backend is fused, but critic is state: give auto or autodiff, or "
+                "critic=observation."
+            )
         if self.exploration == "scheduled" and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
@@ -247,22 +227,6 @@ class AlgoConfig(Section):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "
                 "with hidden layers: give network=mlp or memory=none."
-            )
-
-    def _check_critic(self) -> None:
-        """Refuses settings that a critic of the state does not support."""
-        if self.critic == "state" and self.update_backend == "fused":
-            raise ConfigError(
-                "update_backend is fused, but critic is state: give auto or autodiff, or "
-                "critic=observation."
-            )
-
-    def _check_time_out(self) -> None:
-        allowed = _TIME_OUTS[self.advantage]
-        if self.time_out not in allowed:
-            raise ConfigError(
-                f"time_out is {self.time_out}, but advantage is {self.advantage}: "
-                f"give {' or '.join(allowed)}."
             )
 
 

@@ -1,5 +1,6 @@
 """Chooses how an update is computed: plain autodiff, or a faster way of `ppo/fast/`."""
 
+import importlib
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -65,21 +66,9 @@ def memory_kernels(config: AlgoConfig) -> Any:
     return recurrence if recurrence.fits(config.memory_size, kernel.shared_memory()) else None
 
 
-def find(backend: Backend) -> Learn | None:
-    """Returns the function that learns with a backend; None for autodiff, which `ppo` does."""
-    if backend == "fused":
-        from swarmjax.ppo.fast import tiles
-
-        return tiles.learn
-    if backend == "blocks":
-        from swarmjax.ppo.fast import blocks
-
-        return blocks.learn
-    if backend == "sequences":
-        from swarmjax.ppo.fast import sequences
-
-        return sequences.learn
-    return None
+def find(backend: Backend) -> Learn:
+    """Returns the function of `ppo/fast/` that learns with a backend other than autodiff."""
+    return importlib.import_module(f"swarmjax.ppo.fast.{backend}").learn
 
 
 def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:

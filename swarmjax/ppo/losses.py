@@ -1,5 +1,9 @@
-"""The PPO loss of one minibatch of B samples, some of which may be invalid."""
+"""The PPO loss of one minibatch of B samples, some of which may be invalid.
 
+Actions are drawn from a diagonal Gaussian; U is the size of an action.
+"""
+
+import math
 from typing import Any
 
 import chex
@@ -7,12 +11,15 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from swarmjax.ppo import gaussian
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.networks import Acted, Networks, Params
 
 Metrics = dict[str, jax.Array]
+
+# Weight of the guess of the state that the critic sees. Whole runs with 0.02 solved more than runs
+# with 0 (docs/worlds-notes.md, "The guess of the state").
+GUESS_COST = 0.02
 
 
 @struct.dataclass(kw_only=True)
@@ -53,7 +60,7 @@ def ppo_loss(
     """Computes the loss to minimise.
 
     It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound. If the critic
-    sees the state, guess_cost * guess is added.
+    sees the state, GUESS_COST * guess is added.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
@@ -84,7 +91,7 @@ def ppo_loss(
     Returns:
       The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
       `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
-      `clip_fraction` (0..1) and, if `guess_cost` is not 0, `guess_loss`.
+      `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
     """
     chex.assert_rank([minibatch.observation, minibatch.action], 2)
     chex.assert_rank(
@@ -107,21 +114,20 @@ def _terms(
     def mean(samples: jax.Array) -> jax.Array:
         return jnp.sum(jnp.where(valid, samples, 0.0)) / jnp.maximum(expected_valid, 1.0)
 
-    log_prob = gaussian.log_prob(acted.mean, acted.std, minibatch.action)
+    log_prob = log_density(acted.mean, acted.std, minibatch.action)
     # Masked before exp: an overflow there would turn the masked zero gradient into NaN.
     log_ratio = jnp.where(valid, log_prob - minibatch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
     metrics = {
         "policy_loss": -mean(_clipped_surrogate(ratio, minibatch.advantage, config.clip_epsilon)),
         "value_loss": mean(0.5 * (value - minibatch.return_) ** 2),
-        "bound_loss": mean(jnp.sum(gaussian.beyond_range(acted.mean) ** 2, axis=-1)),
-        "entropy": mean(gaussian.entropy(acted.std)),
+        "bound_loss": mean(jnp.sum(beyond_range(acted.mean) ** 2, axis=-1)),
+        "entropy": mean(entropy(acted.std)),
         # Unbiased and never negative: Schulman 2020, "Approximating KL Divergence", estimator k3.
         "approx_kl": mean(ratio - 1.0 - log_ratio),
         "clip_fraction": mean(jnp.abs(ratio - 1.0) > config.clip_epsilon),
     }
-    # Without a cost the term is left out, so that XLA does not compute the guess.
-    if config.guess_cost and config.critic == "state":
+    if config.critic == "state":
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return metrics
@@ -137,7 +143,7 @@ def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
     )
     if "guess_loss" not in metrics:
         return total
-    return total + config.guess_cost * metrics["guess_loss"]
+    return total + GUESS_COST * metrics["guess_loss"]
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
@@ -166,3 +172,46 @@ def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[
 def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     return jnp.minimum(ratio * advantage, clipped * advantage)
+
+
+def beyond_range(mean: jax.Array) -> jax.Array:
+    """Computes how far a mean action lies beyond the range of commands.
+
+    Args:
+      mean: [B, U], -1..1 spans the commands.
+
+    Returns:
+      [B, U]: 0 within the range, negative below it, positive above it.
+    """
+    return mean - jnp.clip(mean, -1.0, 1.0)
+
+
+def log_density(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array:
+    """Computes the log density of actions under a diagonal Gaussian.
+
+    Args:
+      mean: [B, U].
+      std: [U], above 0.
+      action: [B, U], as drawn, before any clipping.
+
+    Returns:
+      The log density summed over U, [B].
+    """
+    chex.assert_equal_shape([mean, action])
+    chex.assert_shape(std, mean.shape[-1:])
+    standardised = (action - mean) / std
+    density = -0.5 * standardised**2 - jnp.log(std) - 0.5 * math.log(2.0 * math.pi)
+    return jnp.sum(density, axis=-1)
+
+
+def entropy(std: jax.Array) -> jax.Array:
+    """Computes the differential entropy of a diagonal Gaussian.
+
+    Args:
+      std: [U], above 0.
+
+    Returns:
+      The entropy in nats, [].
+    """
+    chex.assert_rank(std, 1)
+    return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))

@@ -11,21 +11,6 @@ from swarmjax.ppo.losses import Metrics
 from swarmjax.ppo.networks import Networks, Params
 from swarmjax.shards import ALONE, Shards
 
-# The metrics of a step with kernels: those of `losses.ppo_loss` for a critic of the observation,
-# the norm of the gradient before clipping, and two flags. One flag is 1 if the step was taken, the
-# other if it was skipped.
-METRICS = (
-    "approx_kl",
-    "bound_loss",
-    "clip_fraction",
-    "entropy",
-    "policy_loss",
-    "value_loss",
-    "grad_norm",
-    "taken_steps",
-    "skipped_steps",
-)
-
 Progress = tuple[Params, optax.OptState]
 
 

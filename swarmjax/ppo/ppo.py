@@ -7,7 +7,7 @@ groups.
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from flax import struct
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.extension import Network
 from swarmjax.ppo import batch as batches
-from swarmjax.ppo import dispatch, exploration, gaussian, losses, networks, normalizer, optimizer
+from swarmjax.ppo import dispatch, losses, networks, normalizer, optimizer
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
@@ -136,7 +136,7 @@ class PPO:
         acted = self.learning.networks.act(learner.params, seen, memory)
         chex.assert_equal_shape([acted.mean, noise])
         action = acted.mean + acted.std * noise
-        return action, gaussian.log_prob(acted.mean, acted.std, action), acted.memory
+        return action, losses.log_density(acted.mean, acted.std, action), acted.memory
 
     def value(
         self, learner: LearnerState, observation: jax.Array, state: Any = (), memory: Any = ()
@@ -196,7 +196,7 @@ class PPO:
         batch = replace(batch, valid=counted & _is_finite(batch))
         samples = _samples(learner, config, batch, shards)
         begun = (learner.params, learner.optimizer_state)
-        learn = dispatch.find(self.backend) or _learn
+        learn = _learn if self.backend == "autodiff" else dispatch.find(self.backend)
         (params, optimizer_state), metrics = learn(self.learning, begun, samples, key)
         # Without a finite sample no step is finite either.
         lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
@@ -226,7 +226,7 @@ class PPO:
             return learner
         # The count stays at its largest value, since a run may go on from another one's count.
         explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
-        std = exploration.scheduled_std(self.config, explored - 1)
+        std = scheduled_std(self.config, explored - 1)
         return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
 
     def explore_anew(self, learner: LearnerState) -> LearnerState:
@@ -278,7 +278,7 @@ def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
 def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
     """Prepares samples for the loss, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
-    if config.advantage == "gae" and config.normalize_advantages:
+    if config.advantage == "gae":
         advantage = _normalize_advantages(advantage, valid, shards)
     samples = Minibatch(
         observation=normalize(learner, batch.observation),
@@ -308,7 +308,7 @@ def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards
 def _learn(
     learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
-    """Runs all epochs, in minibatches; the metrics of each are [epochs, minibatches]."""
+    """Takes all gradient steps, epoch after epoch; returns the metrics of each step."""
     config, shards = learning.config, learning.shards
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
 
@@ -319,12 +319,10 @@ def _learn(
         )
         return optimizer.take(learning, progress, gradient, jnp.any(minibatch.valid))
 
-    def epoch(progress: Progress, key: jax.Array) -> tuple[Progress, Metrics]:
-        # Whole groups are shuffled, because they are faster to gather than single samples.
-        order = _shuffle(key, samples.valid.shape[0], config.num_minibatches, shards)
-        return jax.lax.scan(step, progress, order)
-
-    return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
+    # Whole groups are shuffled, because they are faster to gather than single samples.
+    groups, keys = samples.valid.shape[0], jax.random.split(key, config.epochs)
+    order = jax.vmap(lambda key: _shuffle(key, groups, config.num_minibatches, shards))(keys)
+    return jax.lax.scan(step, begun, order.reshape(-1, order.shape[-1]))
 
 
 def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatch:
@@ -351,3 +349,45 @@ def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> j
 
     first = size * jnp.arange(streams)
     return shards.draw(key, order, axis=1) + jnp.repeat(first, size // minibatches)
+
+
+def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
+    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
+
+    Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
+    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
+    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
+
+    Args:
+      config: With `exploration` scheduled.
+
+    Returns:
+      At least one deviation, in action units.
+    """
+    return tuple(_fall(config))
+
+
+def _fall(config: AlgoConfig) -> Iterator[float]:
+    std = config.initial_std
+    yield std
+    while std > config.std_floor:
+        lower = round(std - config.std_decrement, 4)
+        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
+        if lower == std:
+            return
+        std = config.std_floor if lower <= config.std_floor else lower
+        yield std
+
+
+def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
+    """Looks up the deviation of a control step.
+
+    Args:
+      config: With `exploration` scheduled.
+      step: [...], int32, how many control steps came before, at least 0.
+
+    Returns:
+      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
+    """
+    table = jnp.asarray(scheduled_stds(config), dtype=float)
+    return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

@@ -42,7 +42,7 @@ class Compiled:
 
 
 def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any) -> Compiled:
-    """Compiles `seeds.train_chunk` ahead of time.
+    """Compiles `seeds.chunk` ahead of time.
 
     Args:
       program: the run's program.

@@ -26,7 +26,7 @@ def rows(
     """Turns the metrics of a call into one row for each update and seed.
 
     Args:
-      metrics: [N, rows, ...] as `seeds.train_chunk` returns them. The first n entries of each seed
+      metrics: [N, rows, ...] as `seeds.chunk` returns them. The first n entries of each seed
         hold one update each.
       n: updates of the call.
       stages: names of the stages.

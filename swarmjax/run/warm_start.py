@@ -67,7 +67,7 @@ def carry(source: Kept, state: TrainState, settings: TrainConfig) -> TrainState:
 
     Args:
       source: what is carried over, as `read` gave it.
-      state: the first state, as `seeds.init` gave it.
+      state: the first state, as `mesh.init` gave it.
       settings: the config of the new run.
 
     Raises:

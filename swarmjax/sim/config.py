@@ -168,16 +168,6 @@ class SimConfig(Section):
         default=None,
         metadata=about("physics steps per control step; null: the body's default", 1, 1000),
     )
-    iterations: int | None = field(
-        default=None,
-        metadata=about(
-            "limit of solver iterations; 20 for swarm on wheels; null: a measured default", 1, 1000
-        ),
-    )
-    ls_iterations: int | None = field(
-        default=None,
-        metadata=about("line-search iterations of mjx; null: a measured default", 1, 1000),
-    )
 
     @property
     def robots(self) -> int:

@@ -143,9 +143,7 @@ def choose(sim: "SimConfig", robot: "RobotConfig") -> EngineChoice:
         iterations = _MOST_RUBBING_SWEEPS if rubs else _MOST_SWEEPS
     elif (solver, impl) == ("mjx", "jax"):
         iterations, ls_iterations = _NEWTON_STEPS["wheeled" if rubs else body]
-    return EngineChoice(
-        impl, solver, sim.iterations or iterations, sim.ls_iterations or ls_iterations
-    )
+    return EngineChoice(impl, solver, iterations, ls_iterations)
 
 
 def load_engine(

@@ -4,23 +4,25 @@ The number of updates is an argument, so one program serves every chunk size. An
 the same run.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 from jax import Array
 
 from swarmjax.curriculum import engine as curricula
-from swarmjax.curriculum.engine import CurriculumState, Schedule
+from swarmjax.curriculum.engine import BY_BUDGET, BY_THRESHOLD, CurriculumState, Schedule
 from swarmjax.ppo import batch as batches
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
-from swarmjax.training import episodes, promotion, rollout
+from swarmjax.training import episodes, rollout
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
@@ -125,7 +127,9 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(program, trajectory, state.arenas.recall, ended, config.learners)
-    learners, learned = _learn(program, state.learners, batch, learn_key)
+    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
+    learn_keys = jax.random.split(learn_key, config.learners)
+    learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
     curriculum = curricula.observe(
         program.curriculum(schedule),
         schedule,
@@ -136,7 +140,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         state.update,
         shards,
     )
-    learners = promotion.carry_over(learners, program, state.curriculum, curriculum)
+    learners = carry_over(learners, program, state.curriculum, curriculum)
     before = state.curriculum.chosen
     metrics = {
         "update": state.update,
@@ -165,13 +169,60 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     return new, metrics
 
 
-def _learn(
-    program: Program, learners: LearnerState, batch: Batch, key: Array
-) -> tuple[LearnerState, Metrics]:
-    """Updates all learners with the batch of a rollout; returns them and what PPO reports."""
-    config = program.config
-    explored = rollout.explore(program, learners, config.algo.rollout_length)
-    return jax.vmap(program.ppo.update)(explored, batch, jax.random.split(key, config.learners))
+def carry_over(
+    learners: LearnerState, program: Program, before: CurriculumState, after: CurriculumState
+) -> LearnerState:
+    """Prepares the learners for the stage that begins with a promotion.
+
+    If each robot has a learner and the swarm grows beyond its largest size so far, the new robots
+    copy the others' learners in turn: parameters, optimiser and normaliser. Then the optimiser and
+    the exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has
+    no cost.
+
+    Args:
+      learners: [L].
+      program: the compiled program.
+      before: state of the curriculum before the update.
+      after: and after it. Without a promotion, the learners stay unchanged.
+
+    Returns:
+      The learners, [L].
+    """
+    options, carried = program.config.curriculum, learners
+    if program.config.learners > 1:
+        carried = _copied(carried, before.met, after.met)
+    if options.optimizer == "reset":
+        carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
+    if options.exploration == "reset":
+        carried = program.ppo.explore_anew(carried)
+    if carried is learners:
+        return learners
+    reason = after.chosen.reason
+    promoted = (reason == BY_THRESHOLD) | (reason == BY_BUDGET)
+    return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
+
+
+def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState:
+    """Copies learner i % before to the place of learner i, for before <= i < after."""
+    index = jnp.arange(learners.normalizer.count.shape[0])
+    new = (index >= before) & (index < after)
+    source = jnp.where(new, index % before, index)
+    return jax.tree.map(lambda x: x[source], learners)
+
+
+def _forgotten(state: optax.OptState) -> optax.OptState:
+    """Sets Adam's moments, and the count that corrects their bias, to 0.
+
+    The learning rate's schedule has its own count and goes on.
+    """
+
+    def is_adam(part: object) -> bool:
+        return isinstance(part, optax.ScaleByAdamState)
+
+    def forget(part: optax.OptState) -> optax.OptState:
+        return jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part
+
+    return jax.tree.map(forget, state, is_leaf=is_adam)
 
 
 def _draw(

@@ -18,10 +18,11 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from swarmjax.config import ConfigError
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.shards import AXIS
-from swarmjax.training import seeds
+from swarmjax.sim.physics import PhysicsState
+from swarmjax.training import loop, seeds
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.program import Program, side_by_side
 
 _ALL: Any = PartitionSpec()
 _SEEDS: Any = PartitionSpec("seeds")
@@ -76,7 +77,7 @@ def make(devices: int, axis: str = AXIS) -> Mesh:
 
 
 def init(program: Program) -> Callable[[Schedule], TrainState]:
-    """Returns a function that starts every seed of a run, as `seeds.init` does; `jit` it.
+    """Returns a function that starts every seed of a run; `jit` it.
 
     Args:
       program: the compiled program.
@@ -85,22 +86,16 @@ def init(program: Program) -> Callable[[Schedule], TrainState]:
       A function from the curriculum's numbers to the states [N] before the first update, spread
       over devices.
     """
-    if program.config.devices == 1:
-        return partial(seeds.init, program)
-    layout = _layout(program.config)
-    spread = jax.shard_map(
-        partial(seeds.init, program),
-        mesh=layout.mesh,
-        in_specs=(_ALL, layout.lanes),
-        out_specs=layout.state,
-        check_vma=False,
-    )
-    lanes = np.array(seeds.numbers(program.config), np.uint32)
-    return lambda schedule: spread(schedule, lanes)
+    start = partial(seeds.each, partial(loop.init, program))
+    lanes = np.array(program.config.numbers, np.uint32)
+    if program.config.devices > 1:
+        layout = _layout(program.config)
+        start = _spread(start, layout, (_ALL, layout.lanes), layout.state)
+    return lambda schedule: start(schedule, lanes)
 
 
 def jit_chunk(program: Program) -> Any:
-    """Jits the function that trains every seed for some updates, as `seeds.train_chunk` does.
+    """Jits the function that trains every seed for some updates, `seeds.chunk`.
 
     Args:
       program: the compiled program.
@@ -108,23 +103,29 @@ def jit_chunk(program: Program) -> Any:
     Returns:
       The jitted function; it donates the state, whose arenas are spread over devices.
     """
-    local = partial(seeds.train_chunk, program)
+    local = seeds.chunk(program)
     if program.config.devices == 1:
         return jax.jit(local, donate_argnums=1)
     layout = _layout(program.config)
-    spread = jax.shard_map(
+    chunk = _spread(
         lambda schedule, state, n: local(schedule, _without_empty(state), n),
-        mesh=layout.mesh,
-        in_specs=(_ALL, layout.state, _ALL),
-        out_specs=(layout.state, layout.lanes),
-        check_vma=False,
+        layout,
+        (_ALL, layout.state, _ALL),
+        (layout.state, layout.lanes),
     )
     everywhere = NamedSharding(layout.mesh, _ALL)
     return jax.jit(
-        spread,
+        chunk,
         in_shardings=(everywhere, layout.shardings, everywhere),
         out_shardings=(layout.shardings, NamedSharding(layout.mesh, layout.lanes)),
         donate_argnums=1,
+    )
+
+
+def _spread(function: Any, layout: _Layout, given: Any, returned: Any) -> Any:
+    """Runs a function on each device, with its share of the arguments."""
+    return jax.shard_map(
+        function, mesh=layout.mesh, in_specs=given, out_specs=returned, check_vma=False
     )
 
 
@@ -144,7 +145,7 @@ def put(program: Program, state: TrainState) -> TrainState:
     if state.arenas is None:
         shardings = replace(shardings, arenas=None)
     return jax.tree.map(
-        lambda sharding, part: jax.tree.map(partial(_spread, sharding), part), shardings, state
+        lambda sharding, part: jax.tree.map(partial(_placed, sharding), part), shardings, state
     )
 
 
@@ -159,24 +160,25 @@ def bytes_each(config: ProgramConfig, state: TrainState) -> int:
     return seeds.size(state) - spread + spread // config.devices
 
 
-def stepped_together(program: Program, state: TrainState) -> Any:
-    """Takes out of a state the arenas that the program steps together on one device.
+def stepped_together(program: Program, state: TrainState) -> PhysicsState:
+    """Takes out of a state the arenas that this process's first device steps together.
 
     Args:
       program: the compiled program.
       state: [N] states.
 
     Returns:
-      Result of `seeds.stepped_together`, for the arenas of this process's first device.
+      [N A] arenas if seeds run side by side, [A] if they run one after the other.
     """
     if program.config.devices > 1:
         state = jax.tree.map(lambda x: x.addressable_data(0), state)
-    return seeds.stepped_together(program, state)
+    lanes = side_by_side(program.config)
+    return jax.tree.map(lambda x: x[:lanes].reshape(-1, *x.shape[2:]), state.arenas.sim)
 
 
-def _spread(sharding: NamedSharding, x: jax.Array) -> jax.Array:
+def _placed(sharding: NamedSharding, x: jax.Array) -> jax.Array:
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(_spread(sharding, jax.random.key_data(x)))
+        return jax.random.wrap_key_data(_placed(sharding, jax.random.key_data(x)))
     whole = np.asarray(x)
     return jax.make_array_from_callback(whole.shape, sharding, lambda index: whole[index])
 

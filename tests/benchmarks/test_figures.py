@@ -21,7 +21,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
 from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
-from swarmjax.training import loop, seeds
+from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.program import Program
 
@@ -181,8 +181,8 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
     program: Program, pass_time: Callable[[float], None], tmp_path: Path
 ) -> None:
     schedule = programs.schedule(program.config)
-    state = jax.eval_shape(functools.partial(seeds.init, program), schedule)
-    train = functools.partial(seeds.train_chunk, program)
+    state = jax.eval_shape(mesh.init(program), schedule)
+    train = seeds.chunk(program)
     blank = jax.eval_shape(train, schedule, state, np.int32(2))[1]
     metrics = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), blank)
     metrics["mix"] += 4

@@ -60,9 +60,9 @@ def test_of_a_key_given_twice_the_last_counts():
 
 
 def test_keys_that_no_file_holds_can_be_given():
-    train = load_train(["task.reward.contact=-0.5", "sim.iterations=null", "run.tensorboard=false"])
+    train = load_train(["task.reward.contact=-0.5", "sim.substeps=null", "run.tensorboard=false"])
     assert train.task.reward.contact == -0.5
-    assert train.sim.iterations is None
+    assert train.sim.substeps is None
     assert train.run.tensorboard is False
 
 

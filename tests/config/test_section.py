@@ -33,7 +33,7 @@ STAGE = {"name": "s", "robots": 2, "side": 1.0}
     [
         (load_train, []),
         (load_train, ["stage=s3", "algo.hidden_sizes=[8,16,32]", "run.chunk=9", "run.dir=a b"]),
-        (load_train, ["stage.sequence=[s2,s1]", "sim.iterations=4", "run.chunk=7"]),
+        (load_train, ["stage.sequence=[s2,s1]", "sim.substeps=4", "run.chunk=7"]),
         (partial(load_levels, EvaluateConfig), ["policy=p", "stage=expanded", "workers=2"]),
         (partial(files.load, ExportConfig), ["run=r", "step=3"]),
     ],
@@ -126,7 +126,7 @@ def test_only_true_and_false_are_booleans(value):
 
 
 def test_null_only_where_it_is_allowed():
-    assert build(SimConfig, {"iterations": None}).iterations is None
+    assert build(SimConfig, {"substeps": None}).substeps is None
     assert refusal(build, RewardConfig, {"progress": None}, "task.reward.") == (
         "task.reward.progress is null: give a number."
     )

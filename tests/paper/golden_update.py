@@ -25,7 +25,6 @@ from swarmjax.run.load_settings import load_train
 PAPER = load_train(["algo=paper"]).algo
 CONFIGS = {
     "terminal": PAPER,
-    "leak": replace(PAPER, time_out="leak"),
     # The deviation falls to the schedule's second level, 0.55, between the batch and the update.
     "std": replace(PAPER, std_interval=inputs.STEPS),
 }

@@ -33,7 +33,6 @@ def double() -> dict[str, dict[str, float]]:
     ("case", "compared"),
     [
         ("terminal", set(DOUBLE)),
-        ("leak", set(DOUBLE) - {"params_1"}),
         ("std", {"loss_1", "loss_80"}),
         # Steps in which an arrived robot waits must not affect the update.
         ("waiting", {"returns", "advantages", "loss_1", "params_1"}),

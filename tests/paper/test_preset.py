@@ -54,9 +54,8 @@ def test_the_help_names_the_rows_of_the_algorithm() -> None:
 
 def test_the_preset_leaves_no_number_of_the_learner_to_a_default() -> None:
     given = files.read_choice("algo", "paper")
-    of_gae = {"gae_lambda", "normalize_advantages"}
-    of_others = {"memory_size", "guess_cost"}  # of a memory, and of a critic of the state
-    others = of_gae | of_others | {"update_backend", "network"}  # for speed or extensions
+    of_others = {"gae_lambda", "memory_size"}  # of GAE, and of a memory
+    others = of_others | {"update_backend", "network"}  # for speed or extensions
     keys = {f.name for f in dataclasses.fields(AlgoConfig) if not f.metadata["derived"]}
     assert set(given["algo"]) - {"name"} | others == keys
     rewards = {f.name for f in dataclasses.fields(RewardConfig)} - {"extra"}
@@ -117,10 +116,6 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
         (["algo.std_floor=0.2"],
          "algo.std_floor is 0.2, but exploration is learned: std_floor is an option of scheduled, "
          "so give 0.1 or exploration=scheduled."),
-        (["algo=paper", "algo.time_out=bootstrap"],
-         "algo.time_out is bootstrap, but advantage is monte_carlo: give terminal or leak."),
-        (["algo.time_out=leak"],
-         "algo.time_out is leak, but advantage is gae: give bootstrap or terminal."),
         (["algo=paper", "algo.std_floor=0.7"],
          "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
         (["algo.mean_activation=tanh", "algo.activation=relu"],

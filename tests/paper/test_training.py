@@ -1,7 +1,6 @@
 """Tests the preset's whole training loop at a smaller scale, with two seeds side by side."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -14,7 +13,7 @@ from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.observation import SIZE
-from swarmjax.training import loop, seeds
+from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 
 ROLLOUT, LIMIT, UPDATES = 128, 32, 8
@@ -46,9 +45,9 @@ def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
 
     def chunk(state: loop.TrainState, n: np.int32) -> tuple[loop.TrainState, dict]:
         traces.append(None)
-        return seeds.train_chunk(program, schedule, state, n)
+        return seeds.chunk(program)(schedule, state, n)
 
-    start = jax.jit(partial(seeds.init, program))(schedule)
+    start = jax.jit(mesh.init(program))(schedule)
     run = jax.jit(chunk)
     early, first = run(start, np.int32(3))
     state, rest = run(early, np.int32(5))
@@ -83,7 +82,7 @@ def test_it_trains_and_judges_in_one_trace(config: TrainConfig) -> None:
 
 def test_an_exported_policy_has_the_output_of_tanh(config: TrainConfig, tmp_path: Path) -> None:
     program, schedule = programs.load(config)
-    state = jax.jit(partial(seeds.init, program))(schedule)
+    state = jax.jit(mesh.init(program))(schedule)
     # The last layer is drawn small; ten times larger, it reaches the nonlinear range of tanh.
     actor = state.learners.params["actor"]
     actor = {**actor, "mean": jax.tree.map(lambda x: 10.0 * x, actor["mean"])}

@@ -109,7 +109,5 @@ def test_a_memory_is_trained_in_sequences_on_any_device(monkeypatch: pytest.Monk
 
 
 def test_each_faster_way_has_its_code() -> None:
-    assert dispatch.find("blocks") is not None
-    assert dispatch.find("fused") is not None
-    assert dispatch.find("sequences") is not None
-    assert dispatch.find("autodiff") is None
+    for backend in ("blocks", "fused", "sequences"):
+        assert callable(dispatch.find(backend))

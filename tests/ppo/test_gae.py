@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.ppo.gae import generalized_advantages
+from swarmjax.ppo.batch import generalized_advantages
 
 T, B = 12, 7
 Rollout = dict[str, np.ndarray]

@@ -178,7 +178,7 @@ def _shared(paid: jax.Array) -> jax.Array:
 
 
 def _iterate(ppo: PPO, deaf: bool, carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-    from swarmjax.ppo.gae import generalized_advantages
+    from swarmjax.ppo.batch import generalized_advantages
 
     (state, world), config = carry, ppo.config
     roll, learn = jax.random.split(key)

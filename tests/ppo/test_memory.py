@@ -13,9 +13,8 @@ from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import ConfigError
 from swarmjax.ppo import losses
-from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.batch import Batch, generalized_advantages
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.losses import Minibatch
 from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall
 from swarmjax.ppo.networks import Sizes

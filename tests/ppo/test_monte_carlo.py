@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.ppo.monte_carlo import monte_carlo_returns, normalize
+from swarmjax.ppo.batch import monte_carlo_returns, normalize_returns
 
 REWARD = np.array([1.0, 2.0, 4.0, 8.0, 16.0], np.float32)
 
@@ -45,7 +45,7 @@ def test_returns_are_normalised_over_the_valid_samples() -> None:
     returns = random.normal(3.0, 2.0, (50, 4))
     valid = random.random((50, 4)) < 0.6
     returns[~valid] = 1e6
-    found = np.asarray(normalize(jnp.asarray(returns, jnp.float32), jnp.asarray(valid)))
+    found = np.asarray(normalize_returns(jnp.asarray(returns, jnp.float32), jnp.asarray(valid)))
     inside = returns[valid]
     expected = (inside - inside.mean()) / (inside.std(ddof=1) + 1e-7)
     # float32 rounding of values around 3, with a deviation of 2.
@@ -55,6 +55,6 @@ def test_returns_are_normalised_over_the_valid_samples() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_samples_give_no_nan(count: int) -> None:
     valid = np.arange(3) < count
-    found = normalize(jnp.asarray(REWARD[:3]), jnp.asarray(valid))
+    found = normalize_returns(jnp.asarray(REWARD[:3]), jnp.asarray(valid))
     assert np.isfinite(found).all()
     assert not found[:count].any()

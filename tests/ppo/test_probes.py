@@ -15,11 +15,10 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.batch import Batch, generalized_advantages
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import fused
-from swarmjax.ppo.gae import generalized_advantages
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 

@@ -14,8 +14,8 @@ from swarmjax.run import checkpoint, warm_start
 from swarmjax.run.checkpoint import CheckpointError, Checkpoints, Kept, digest
 from swarmjax.run.load_settings import load_train, read_config
 from swarmjax.run.settings import TrainConfig
+from swarmjax.training import mesh
 from swarmjax.training import program as programs
-from swarmjax.training import seeds
 from swarmjax.training.loop import TrainState
 
 UPDATES = 3
@@ -60,7 +60,8 @@ def _load(words: list[str]) -> tuple[Kept, TrainState, TrainConfig]:
     settings = load_train([*TINY, *words])
     source = warm_start.read(settings)
     assert source is not None
-    return source, seeds.init(*programs.load(settings)), settings
+    program, schedule = programs.load(settings)
+    return source, mesh.init(program)(schedule), settings
 
 
 def _rows(run: Path) -> list[dict]:

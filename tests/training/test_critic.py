@@ -15,7 +15,7 @@ from flax import linen as nn
 from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
-from swarmjax.ppo import dispatch, networks, ppo
+from swarmjax.ppo import dispatch, losses, networks, ppo
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -26,7 +26,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
 from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
-from swarmjax.training import loop, rollout, seeds
+from swarmjax.training import loop, mesh, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.program import Program
 from swarmjax.training.rollout import Arena
@@ -154,8 +154,8 @@ def test_seeds_side_by_side_are_those_alone(tiny_config: TrainConfig) -> None:
     def run(first: int, count: int) -> dict[str, np.ndarray]:
         config = replace(tiny_config, algo=algo, seed=first, seeds=count, seeds_by="vmap")
         program, schedule = programs.load(config)
-        state = jax.jit(partial(seeds.init, program))(schedule)
-        state, _ = jax.jit(partial(seeds.train_chunk, program))(schedule, state, np.int32(1))
+        state = jax.jit(mesh.init(program))(schedule)
+        state, _ = jax.jit(seeds.chunk(program))(schedule, state, np.int32(1))
         return to_leaves(state.learners.params)
 
     together = run(0, 2)
@@ -222,10 +222,11 @@ def test_a_value_that_only_the_state_tells_is_learned() -> None:
 
 @pytest.mark.parametrize("backend", ["autodiff", pytest.param("blocks", marks=pytest.mark.slow)])
 def test_a_state_changes_nothing_of_the_policy_but_by_its_guess(
-    backend: dispatch.Backend,
+    backend: dispatch.Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(losses, "GUESS_COST", 0.0)
     # No clipping here: it scales both networks by one norm, so the critic would change the actor.
-    config = replace(CONFIG, num_minibatches=1, max_grad_norm=None, guess_cost=0.0)
+    config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
     made = _ppo(config, backend)
     learner = made.init(jax.random.key(0))
     batch = replace(_batch(learner, 0), advantage=_batch(learner, 1).return_)

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,7 +15,7 @@ from swarmjax.run.load_settings import load_train
 from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.episode import Ended, Robots
-from swarmjax.training import episodes, seeds
+from swarmjax.training import episodes, mesh
 from swarmjax.training import program as programs
 
 
@@ -112,7 +111,7 @@ def train_for(tiny_config: TrainConfig) -> Train:
         run=replace(tiny_config.run, episodes=True, tensorboard=False),
     )
     program, schedule = programs.load(base, by_robot=True)
-    init = jax.jit(partial(seeds.init, program))
+    init = jax.jit(mesh.init(program))
     compiled = compile_chunk(program, schedule, init(schedule))
 
     def train_for(run: Path, updates: int, *, resume: bool = False) -> None:

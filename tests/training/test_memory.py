@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.ppo import gaussian, losses, ppo
+from swarmjax.ppo import losses, ppo
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.ppo import LearnerState
@@ -74,7 +74,7 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     minibatch = ppo._gather(samples, rows, config)
     nets = trained.program.ppo.learning.networks
     (mean, std, *_), value = losses.evaluate(_one(learners).params, nets, minibatch)
-    log_prob = gaussian.log_prob(mean, std, minibatch.action)
+    log_prob = losses.log_density(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
     assert trained.over.any()  # episodes end within the rollout

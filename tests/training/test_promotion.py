@@ -17,8 +17,8 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.settings import TrainConfig
+from swarmjax.training import loop
 from swarmjax.training import program as programs
-from swarmjax.training import promotion
 from swarmjax.training.program import Program
 
 LEARNERS, OBSERVED = 5, 3
@@ -76,7 +76,7 @@ def _promote(
     reason = jnp.int32(engine.BY_THRESHOLD if promoted else engine.STAYED)
     now = replace(state.own, chosen=state.chosen._replace(reason=reason))
     met = jnp.int32(before), jnp.int32(after)
-    return promotion.carry_over(
+    return loop.carry_over(
         trained, program, replace(state, met=met[0]), replace(state, own=now, met=met[1])
     )
 

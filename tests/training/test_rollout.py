@@ -13,7 +13,7 @@ from entries import DISTANCE, INFRARED
 
 from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.engine import Next
-from swarmjax.ppo import batch, gae
+from swarmjax.ppo import batch
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY
@@ -200,7 +200,7 @@ def _random_trajectory(shape: tuple[int, int, int, int]) -> Trajectory:
 def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
     shape = (5, count, 4, robots)
     trajectory = _random_trajectory(shape)
-    advantage, return_ = gae.generalized_advantages(
+    advantage, return_ = batch.generalized_advantages(
         *trajectory[5:6],
         *trajectory[3:5],
         *trajectory[6:8],
@@ -219,30 +219,15 @@ def test_batch_groups_the_samples_of_an_arena(count: int, robots: int) -> None:
     assert found.valid.shape == (count, 4, 5 * robots)
 
 
-def test_a_step_limit_may_be_terminal_to_bootstrapped_returns() -> None:
-    trajectory = _random_trajectory((20, 2, 3, 1))
-    config = AlgoConfig(discount=0.9, time_out="terminal")
-    found = _samples(trajectory, config).return_[..., 0]
-    # A sample where physics broke is truncated and not valid. Its return still bootstraps.
-    timed_out = trajectory.truncated & trajectory.valid
-    terminal = trajectory._replace(terminated=trajectory.terminated | timed_out)
-    expected = _samples(terminal, AlgoConfig(discount=0.9)).return_[..., 0]
-    np.testing.assert_array_equal(found, expected)
-    assert np.any(found != _samples(trajectory, AlgoConfig(discount=0.9)).return_[..., 0])
-
-
-@pytest.mark.parametrize("time_out", ["terminal", "leak"])
-def test_monte_carlo_returns_are_targets_and_advantages(time_out: str) -> None:
+def test_monte_carlo_returns_are_targets_and_advantages() -> None:
     shape = (20, 2, 3, 1)
     trajectory = _random_trajectory(shape)
-    config = AlgoConfig(discount=0.9, advantage="monte_carlo", time_out=time_out)
+    config = AlgoConfig(discount=0.9, advantage="monte_carlo")
     found = _samples(trajectory, config)
     reward, terminated, truncated, valid = (np.asarray(x) for x in trajectory[5:9])
     following, returns = np.zeros(shape[1:]), np.zeros(shape)
     for t in reversed(range(shape[0])):
-        # With time_out=leak, a step limit ends no return; broken physics always ends it.
-        cut = truncated[t] if time_out == "terminal" else truncated[t] & ~valid[t]
-        following = reward[t] + 0.9 * np.where(terminated[t] | cut, 0.0, following)
+        following = reward[t] + 0.9 * np.where(terminated[t] | truncated[t], 0.0, following)
         returns[t] = following
     for learner in range(2):  # each normalises over its own samples
         mine = np.s_[:, learner, :, 0]

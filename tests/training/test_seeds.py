@@ -16,7 +16,7 @@ from swarmjax.run.checkpoint import Leaves, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
 from swarmjax.task.env import World
-from swarmjax.training import loop, seeds
+from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.program import Program
@@ -30,11 +30,11 @@ def _program(config: TrainConfig, world: World, count: int, first: int = 0) -> P
 
 
 def _start(program: Program) -> TrainState:
-    return jax.jit(partial(seeds.init, program))(programs.schedule(program.config))
+    return jax.jit(mesh.init(program))(programs.schedule(program.config))
 
 
 def _run(program: Program) -> Run:
-    return partial(jax.jit(partial(seeds.train_chunk, program)), programs.schedule(program.config))
+    return partial(jax.jit(seeds.chunk(program)), programs.schedule(program.config))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def run(side_by_side: Program) -> Run:
     def chunk(
         schedule: curriculum.Schedule, state: TrainState, n: np.int32
     ) -> tuple[TrainState, dict]:
-        return seeds.train_chunk(side_by_side, schedule, state, jnp.asarray(n))
+        return seeds.chunk(side_by_side)(schedule, state, jnp.asarray(n))
 
     chex.clear_trace_counter()  # it counts by a function's address, which may be reused
     traced_once = jax.jit(chex.assert_max_traces(chunk, n=1))
@@ -163,7 +163,7 @@ def test_every_seed_has_a_curriculum_of_its_own(start: TrainState, run: Run) -> 
 def test_what_is_stepped_together_lies_on_one_axis(
     tiny_config: TrainConfig, tiny_world: World, start: TrainState, side_by_side: Program
 ) -> None:
-    flat = seeds.stepped_together(side_by_side, start).qpos
+    flat = mesh.stepped_together(side_by_side, start).qpos
     held = np.asarray(start.arenas.sim.qpos)
     assert held.shape[:2] == (SEEDS, tiny_config.arenas)
     np.testing.assert_array_equal(flat, np.concatenate(list(held)))

@@ -6,15 +6,14 @@ seeds run one after the other. In a vectorised loop every learner would take as 
 with the most samples.
 """
 
-import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from swarmjax.ppo import losses, optimizer
-from swarmjax.ppo.fast.valid_first import valid_first
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
 from swarmjax.ppo.optimizer import Learning, Progress
@@ -49,18 +48,18 @@ def learn(
     Returns:
       Parameters and the optimiser's state after, and the metrics of each step, [epochs].
     """
-    return in_turn(functools.partial(_learn, learning))(begun, samples)
 
+    @jax.custom_batching.sequential_vmap
+    def one_learner(begun: Progress, samples: Minibatch) -> tuple[Progress, Metrics]:
+        blocks, count = arrange(samples), learning.shards.sum(jnp.sum(samples.valid))
 
-def _learn(learning: Learning, begun: Progress, samples: Minibatch) -> tuple[Progress, Metrics]:
-    """Runs all epochs, each one step on all samples; the metrics of each are [epochs]."""
-    blocks, count = arrange(samples), learning.shards.sum(jnp.sum(samples.valid))
+        def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
+            found = gradient(progress[0], blocks, learning, count)
+            return optimizer.take(learning, progress, found, count > 0)
 
-    def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
-        found = gradient(progress[0], blocks, learning, count)
-        return optimizer.take(learning, progress, found, count > 0)
+        return jax.lax.scan(epoch, begun, length=learning.config.epochs)
 
-    return jax.lax.scan(epoch, begun, length=learning.config.epochs)
+    return one_learner(begun, samples)
 
 
 def arrange(samples: Minibatch) -> Blocks:
@@ -127,6 +126,21 @@ def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
     return jax.lax.fori_loop(0, count, add, nothing)
 
 
-def in_turn[**P, T](function: Callable[P, T]) -> Callable[P, T]:
-    """Makes `vmap` of a function, at any depth, apply it to one element after the other."""
-    return jax.custom_batching.sequential_vmap(function)
+def valid_first(samples: Minibatch) -> Minibatch:
+    """Lays all samples out along one axis, the valid ones first and in their given order.
+
+    Args:
+      samples: [G, N, ...].
+
+    Returns:
+      [G N, ...]. Behind the valid samples come copies of other samples, marked as not valid.
+    """
+    groups, each = samples.valid.shape
+    within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
+    before = jnp.cumsum(within[:, -1]) - within[:, -1]
+    index = jnp.arange(groups * each, dtype=jnp.int32)
+    beyond = groups * each + index  # out of range, so dropped; all differ, as unique_indices needs
+    place = jnp.where(samples.valid.ravel(), (before[:, None] + within - 1).ravel(), beyond)
+    source = jnp.zeros_like(index).at[place].set(index, mode="drop", unique_indices=True)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[source], samples)
+    return replace(flat, valid=index < jnp.sum(within[:, -1]))

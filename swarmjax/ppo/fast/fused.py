@@ -23,14 +23,17 @@ from dataclasses import replace
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 from jax.flatten_util import ravel_pytree
 
-from swarmjax.ppo import gaussian
+from swarmjax.ppo import losses, optimizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
+from swarmjax.ppo.fast.blocks import valid_first
 from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
 from swarmjax.ppo.losses import Metrics, Minibatch
 from swarmjax.ppo.networks import Params
+from swarmjax.ppo.optimizer import Learning, Progress
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
 # each of the 128 threads then uses all of its 255 registers, and a program uses 80 kB of the chip's
@@ -40,6 +43,21 @@ LAUNCH = Launch(tile=64, programs=264, warps=4)
 LARGE = Launch(tile=128, programs=264, warps=8)
 # Fewest tiles of a minibatch: with fewer, one tile more or less makes minibatches too unequal.
 _LEAST_TILES = 8
+
+# The metrics of a step with kernels: those of `losses.ppo_loss` for a critic of the observation,
+# the norm of the gradient before clipping, and two flags. One flag is 1 if the step was taken, the
+# other if it was skipped.
+METRICS = (
+    "approx_kl",
+    "bound_loss",
+    "clip_fraction",
+    "entropy",
+    "policy_loss",
+    "value_loss",
+    "grad_norm",
+    "taken_steps",
+    "skipped_steps",
+)
 
 _Run = functools.partial[tuple[jax.Array, Metrics]]
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
@@ -54,7 +72,7 @@ def fits(config: AlgoConfig, observation_size: int, action_size: int) -> bool:
       action_size: U.
 
     Returns:
-      Whether `gradient` may be called.
+      Whether `learn` may be called.
     """
     return kernel.fits(observation_size, config.hidden_sizes, action_size, LAUNCH.tile)
 
@@ -78,49 +96,6 @@ def choose_launch(
         return LAUNCH
     sizes = (observation_size, config.hidden_sizes, action_size)
     return LARGE if kernel.fits(*sizes, LARGE.tile, kernel.shared_memory()) else LAUNCH
-
-
-def gradient(
-    params: Params,
-    minibatch: Minibatch,
-    config: AlgoConfig,
-    expected_valid: jax.Array,
-    *,
-    launch: Launch | None = None,
-    interpret: bool = False,
-) -> tuple[Params, Metrics]:
-    """Computes what `jax.grad(losses.ppo_loss, has_aux=True)` does, up to rounding.
-
-    Args:
-      params: Parameters of the actor and the critic, with layers that `fits` accepts.
-      minibatch: B samples.
-      config: Clip range and costs.
-      expected_valid: [], as `losses.ppo_loss` takes it.
-      launch: How the kernels are spread over the GPU; None: `choose_launch` decides.
-      interpret: Whether to run them as ordinary JAX, on any device.
-
-    Returns:
-      The gradient, in the shape of `params`, and the metrics, each [].
-
-    Raises:
-      ValueError: `fits` refuses the layers.
-    """
-    sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
-    launch = choose_launch(config, *sizes) if launch is None else launch
-    count = -(-len(minibatch.valid) // launch.tile)
-    tiles = Tiles(jnp.arange(count), jnp.array([0, count]))
-    mask = minibatch.valid.astype(bool).astype(jnp.float32)
-    found, metrics, _ = flat_gradient(
-        flatten(params),
-        layouts(params),
-        replace(minibatch, valid=mask),
-        tiles,
-        config,
-        expected_valid,
-        launch=launch,
-        interpret=interpret,
-    )
-    return unflatten(found, params), metrics
 
 
 def flatten(params: Params) -> Flat:
@@ -245,7 +220,7 @@ def flat_gradient(
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
-    metrics["entropy"] = gaussian.entropy(deviation) * weight
+    metrics["entropy"] = losses.entropy(deviation) * weight
     found = {
         "actor": _with_entropy(actor * share, config, weight, first, width),
         "critic": critic * (config.value_cost * share),
@@ -342,7 +317,7 @@ def _surrogate(
         * advantage
     )
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
-    beyond = jnp.where(valid[:, None], gaussian.beyond_range(mean), 0.0)
+    beyond = jnp.where(valid[:, None], losses.beyond_range(mean), 0.0)
     slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
     if config.mean_activation == "tanh":
         slope *= 1.0 - mean * mean
@@ -369,3 +344,60 @@ def _half_square(
         "value_loss": 0.5 * error * error,
         "valid": samples["valid"],
     }
+
+
+def learn(
+    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
+) -> tuple[Progress, Metrics]:
+    """Learns from a batch, in minibatches of tiles of valid samples.
+
+    Each device deals out its own tiles. The samples of a minibatch therefore depend on the number
+    of devices as well as on the random streams.
+
+    Here each network is one vector, and the optimiser's state for each network is also one vector.
+    With two dozen small arrays instead, most kernels of a minibatch would handle only one array
+    each.
+
+    Args:
+      learning: Settings and networks that `fits` accepts, and the optimiser.
+      begun: Parameters and the optimiser's state.
+      samples: [G, N, ...], zero where not valid.
+      key: Random key, consumed.
+
+    Returns:
+      Parameters and the optimiser's state after, and the metrics of each step, [steps].
+    """
+    params, state = begun
+    config, shards = learning.config, learning.shards
+    flat_state = _flat_state(learning, *begun)
+    layout, arranged = layouts(params), valid_first(samples)
+    valid = jnp.sum(arranged.valid, dtype=jnp.int32)
+    arranged = replace(arranged, valid=arranged.valid.astype(jnp.float32))
+    count, size = arranged.observation.shape
+    launch = choose_launch(config, size, arranged.action.shape[-1], count)
+    keys = jax.random.split(shards.own_key(key), config.epochs)
+    dealt = shuffle(keys, count, valid, config.num_minibatches, launch)
+    expected_valid = shards.sum(valid) / config.num_minibatches
+
+    def step(progress: Progress, span: jax.Array) -> tuple[Progress, jax.Array]:
+        tiles = dealt._replace(span=span)
+        gradient, metrics, taken = flat_gradient(
+            progress[0], layout, arranged, tiles, config, expected_valid, launch=launch
+        )
+        progress, metrics = optimizer.take(learning, progress, (gradient, metrics), taken > 0)
+        return progress, jnp.stack([metrics[name] for name in METRICS])
+
+    (flat, flat_state), rows = jax.lax.scan(step, (flatten(params), flat_state), dealt.span)
+    learned = unflatten(flat, params), _tree_state(flat_state, state)
+    return learned, dict(zip(METRICS, rows.T, strict=True))
+
+
+def _flat_state(learning: Learning, params: Params, state: optax.OptState) -> optax.OptState:
+    """Converts the optimiser's state: one vector for each network instead of a tree."""
+    like = jax.eval_shape(learning.optimizer.init, flatten(params))
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[0] if x.ndim else tree, like, state)
+
+
+def _tree_state(flat: optax.OptState, like: optax.OptState) -> optax.OptState:
+    """Undoes `_flat_state`."""
+    return jax.tree.map(lambda x, tree: ravel_pytree(tree)[1](x) if x.ndim else x, flat, like)

@@ -41,7 +41,6 @@ _SEEN = jnp.bfloat16
 _SIZES = (16, 32, 64)
 
 _Three = tuple[jax.Array, ...]  # arrays of reset, update and candidate
-_Kept = tuple[jax.Array, ...]
 
 
 class _Rows(NamedTuple):

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
-from swarmjax.ppo import gaussian, losses, optimizer
+from swarmjax.ppo import losses, optimizer
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
@@ -58,7 +58,7 @@ def _log_prob(
     params: Params, config: AlgoConfig, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
     acted = _nets(config).act(params, observation, ())
-    return gaussian.log_prob(acted.mean, acted.std, action)
+    return losses.log_density(acted.mean, acted.std, action)
 
 
 def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> Minibatch:
@@ -92,7 +92,33 @@ def _fused(
     params: Params, minibatch: Minibatch, config: AlgoConfig, count: Any, launch: Launch
 ) -> Any:
     with jax.default_matmul_precision("highest"):
-        return fused.gradient(params, minibatch, config, count, launch=launch, interpret=True)
+        return _gradient(params, minibatch, config, count, launch=launch, interpret=True)
+
+
+def _gradient(
+    params: Params,
+    minibatch: Minibatch,
+    config: AlgoConfig,
+    count: Any,
+    *,
+    launch: Launch | None = None,
+    interpret: bool = False,
+) -> Any:
+    """Computes with the kernels what `jax.grad(losses.ppo_loss, has_aux=True)` does."""
+    sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
+    launch = fused.choose_launch(config, *sizes) if launch is None else launch
+    tiles = -(-len(minibatch.valid) // launch.tile)
+    found, metrics, _ = fused.flat_gradient(
+        fused.flatten(params),
+        fused.layouts(params),
+        replace(minibatch, valid=minibatch.valid.astype(bool).astype(jnp.float32)),
+        kernel.Tiles(jnp.arange(tiles), jnp.array([0, tiles])),
+        config,
+        count,
+        launch=launch,
+        interpret=interpret,
+    )
+    return fused.unflatten(found, params), metrics
 
 
 def _assert_close(found: Any, expected: Any) -> None:
@@ -190,7 +216,7 @@ def test_triton_knows_all_that_the_kernels_do(activation: Any, launch: Launch, t
     params = _params(config)
     minibatch = _minibatch(params, config, 1000)
     text = _lowered(
-        lambda p, m: fused.gradient(p, m, config, jnp.float32(700.0), launch=launch),
+        lambda p, m: _gradient(p, m, config, jnp.float32(700.0), launch=launch),
         params,
         minibatch,
     )
@@ -201,7 +227,7 @@ def test_triton_knows_all_that_the_kernels_do(activation: Any, launch: Launch, t
 
 @pytest.mark.filterwarnings("ignore:The Pallas Triton backend is deprecated:DeprecationWarning")
 def test_triton_takes_learners_and_seeds_as_further_axes_of_its_grid() -> None:
-    function = jax.vmap(jax.vmap(lambda p, m, n: fused.gradient(p, m, SMALL, n)))
+    function = jax.vmap(jax.vmap(lambda p, m, n: _gradient(p, m, SMALL, n)))
     text = _lowered(function, *_several(2, 3))
     assert text.count("grid_x = 1 : i32, grid_y = 3 : i32, grid_z = 2 : i32") == 2
 
@@ -214,9 +240,7 @@ def test_products_have_the_precision_that_jax_is_set_to(
     minibatch = _minibatch(params, SMALL, 40)
     with jax.default_matmul_precision(precision):
         jaxpr = str(
-            jax.make_jaxpr(lambda p, m: fused.gradient(p, m, SMALL, jnp.float32(1.0)))(
-                params, minibatch
-            )
+            jax.make_jaxpr(lambda p, m: _gradient(p, m, SMALL, jnp.float32(1.0)))(params, minibatch)
         )
     # Actor and critic each compute two matrix products forward and three backward.
     assert jaxpr.count("dot_general[") == 10
@@ -373,7 +397,7 @@ def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
         "taken_steps",
         "skipped_steps",
     )  # metrics that `optimizer.take` adds to the metrics of the loss
-    assert sorted(expected) == [name for name in optimizer.METRICS if name not in of_the_step]
+    assert sorted(expected) == [name for name in fused.METRICS if name not in of_the_step]
 
 
 @pytest.mark.parametrize("name", ["actor", "critic"])
@@ -415,7 +439,7 @@ def test_layers_fit_by_their_widths_and_by_the_memory_on_the_chip(
     if not possible:
         params = _params(config)
         with pytest.raises(ValueError, match="do not take"):
-            fused.gradient(params, _minibatch(params, config, 4), config, jnp.float32(1.0))
+            _gradient(params, _minibatch(params, config, 4), config, jnp.float32(1.0))
 
 
 def test_a_wide_observation_does_not_fit() -> None:
