@@ -49,7 +49,7 @@ class Policy(NamedTuple):
 
     @property
     def neighbours(self) -> dict[str, Any]:
-        """Neighbour settings: `count`, `range` (m) and `message_size`; empty if not used."""
+        """Neighbour settings: `count` and `range` (m); empty if not used."""
         return self.meta["observation"].get("neighbours", {})
 
     @property
@@ -262,9 +262,7 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). If robots send
-      messages, these follow, within -1..1.
+      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive).
     """
-    speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
-    drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]
-    return np.stack([*drive, *said], -1)
+    speed, turn = np.moveaxis(np.clip(action, -1, 1), -1, 0)
+    return np.stack([(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate], -1)

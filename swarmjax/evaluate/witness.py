@@ -25,7 +25,7 @@ _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
 _TOLD = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 # Each policy has its own values of these keys, because they determine its network's inputs.
-_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range", "message_size"))
+_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range"))
 
 
 class Trained(NamedTuple):
@@ -60,7 +60,8 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
     if "neighbours" in meta["observation"]:
-        task["neighbours"] = meta["observation"]["neighbours"]
+        held = meta["observation"]["neighbours"]
+        task["neighbours"] = {"count": held["count"], "range": held["range"]}
     return Trained(
         robot=build(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),

@@ -161,10 +161,11 @@ def _check_alike(init_from: str, stored: TrainConfig, settings: TrainConfig) -> 
             settings.algo.mean_activation,
             f"algo.mean_activation={output}",
         ),
-        *(
-            (f"task.neighbours.{key}", *values, f"task.neighbours.{key}={values[0]}")
-            for key in ("count", "message_size")
-            for values in [[getattr(x.task.neighbours, key) for x in (stored, settings)]]
+        (
+            "task.neighbours.count",
+            heard := stored.task.neighbours.count,
+            settings.task.neighbours.count,
+            f"task.neighbours.count={heard}",
         ),
         ("encoding of observations", seen, needed, f"task.encoding={seen}"),
     ):
