@@ -7,7 +7,6 @@ module joins them, and writes and shows the result.
 import json
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -15,7 +14,7 @@ from rich.progress import Progress
 
 from swarmjax import command, outputs
 from swarmjax.evaluate import table as evaluate_table
-from swarmjax.evaluate import unfinished, witness
+from swarmjax.evaluate import witness
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
@@ -30,23 +29,20 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings, said = witness.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
-    keep = None if out is None else unfinished.place(out)
-    if out is not None and keep is not None:
-        written = [*_files(out), keep / unfinished.ABOUT]
-        outputs.check("out", written, overwrite=settings.overwrite)
+    if out is not None:
+        outputs.check("out", _files(out), overwrite=settings.overwrite)
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            found = evaluate(settings, progress, partial(_say, said, keep), keep)
+            found = evaluate(settings, progress, lambda: _say(said))
     except KeyboardInterrupt:
-        sys.stderr.write(f"swarmjax.evaluate: interrupted, {_left(keep)}.\n")
+        sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
-    if out is not None and keep is not None:
+    if out is not None:
         limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
         outputs.write(_content(out, found, max(limits) * settings.task.control_step))
-        unfinished.remove(keep)
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
@@ -54,26 +50,10 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
-    """Prints which settings come from the policies, before judging starts.
-
-    Judging takes a minute.
-    """
+def _say(sentence: str) -> None:
+    """Prints which settings come from the policies, before judging, which takes a minute."""
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
-    if done:
-        sys.stdout.write(
-            f"swarmjax.evaluate: {done} of {cells} cells were judged before, in {keep}\n"
-        )
     sys.stdout.flush()
-
-
-def _left(keep: Path | None) -> str:
-    """Describes what an interrupted evaluation has saved."""
-    done = 0 if keep is None else unfinished.count(keep)
-    if not done:
-        return "nothing was written"
-    are = "1 cell is" if done == 1 else f"{done} cells are"
-    return f"{are} in {keep}, and the same command continues with the rest"
 
 
 def _files(out: Path) -> list[Path]:
