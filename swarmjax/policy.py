@@ -85,7 +85,7 @@ def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
             raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
         with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
-            arrays = _unpack(file)
+            arrays = unpack(file)
         said, text = _text(arrays, "digest"), _text(arrays, "meta")
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
@@ -133,8 +133,8 @@ def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
     return zipfile.ZipFile(file)
 
 
-def _unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; refuses one that unpacks to more bytes than the file has."""
+def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
+    """Reads the arrays of an archive; refuses one that unpacks to more bytes than it has."""
     with open_archive(file) as archive:
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:

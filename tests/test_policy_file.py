@@ -19,7 +19,7 @@ from policies import Arrays, forge, saved, several
 from swarmjax import command, policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import __main__ as evaluate_command
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
@@ -655,7 +655,7 @@ def test_any_field_of_a_signed_file_may_hold_anything(tmp_path: Path, value: Any
         forge(path, arrays, trained)
         where[key] = before
         with contextlib.suppress(PolicyError, ConfigError):  # the only two errors that are allowed
-            witness.load(EvaluateConfig, [f"policy={path}"])
+            trained_settings.load(EvaluateConfig, [f"policy={path}"])
             export.convert(ExportConfig(policy=str(path), format="c"), path, tmp_path / "out")
 
 

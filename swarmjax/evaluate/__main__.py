@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from swarmjax import command, outputs
 from swarmjax.evaluate import table as evaluate_table
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
@@ -27,7 +27,7 @@ _NAMES = ("result.json", "levels.csv", "measures.png", "times.png")
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings, said = witness.load(EvaluateConfig, arguments)
+    settings, said = trained_settings.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
     if out is not None:
         outputs.check("out", _files(out), overwrite=settings.overwrite)
@@ -36,17 +36,17 @@ def main(arguments: Sequence[str]) -> int:
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            found = evaluate(settings, progress, lambda: _say(said))
+            evaluation = evaluate(settings, progress, lambda: _say(said))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
     if out is not None:
-        limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
-        outputs.write(_content(out, found, max(limits) * settings.task.control_step))
+        limits = [specialise(settings, trial.cell).step_limit for trial in evaluation.trials]
+        outputs.write(_content(out, evaluation, max(limits) * settings.task.control_step))
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
-    evaluate_table.show(console, found.result)
+    evaluate_table.show(console, evaluation.result)
     return 0
 
 
@@ -61,17 +61,17 @@ def _files(out: Path) -> list[Path]:
     return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
-def _content(out: Path, found: Evaluation, limit: float) -> dict[Path, bytes]:
+def _content(out: Path, evaluation: Evaluation, limit: float) -> dict[Path, bytes]:
     """Makes the JSON file, or all files of a folder; `limit` is an episode's length, s."""
-    text = (json.dumps(found.result, indent=2, allow_nan=False) + "\n").encode()
+    text = (json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n").encode()
     if out.suffix == ".json":
         return {out: text}
-    levels = evaluate_table.levels(found.entrants, found.trials)
+    levels = evaluate_table.levels(evaluation.entrants, evaluation.trials)
     files = {"result.json": text, "levels.csv": levels.encode()}
-    if "policies" in found.result:
+    if "policies" in evaluation.result:
         from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
-        drawn = figures.png_files(found.result, found.trials, limit)
+        drawn = figures.png_files(evaluation.result, evaluation.trials, limit)
         files |= {f"{name}.png": content for name, content in drawn.items()}
     return {out / name: content for name, content in files.items()}
 

@@ -103,8 +103,8 @@ def _sum_up(
 
 def _rows(trial: Trial, rows: slice) -> Trial:
     """Keeps some of the policies of a trial."""
-    found = {name: table[rows] for name, table in trial.found.items()}
-    return trial._replace(found=found, arrival=trial.arrival[rows])
+    tables = {name: table[rows] for name, table in trial.measures.items()}
+    return trial._replace(measures=tables, arrival=trial.arrival[rows])
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:
@@ -139,13 +139,13 @@ def list_files(key: str, text: str) -> list[str]:
     Raises:
       ConfigError: A pattern matches nothing, or a file is named twice.
     """
-    found: list[str] = []
+    files: list[str] = []
     for part in [text] if os.path.isfile(text) else text.split(","):
         matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
         if not matches or not part:
             raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
-        found += matches
-    for file in found:
-        if found.count(file) > 1:
+        files += matches
+    for file in files:
+        if files.count(file) > 1:
             raise ConfigError(f"{key} is {show(text)}, which names {file} twice: give it once.")
-    return found
+    return files

@@ -17,7 +17,7 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_c, engine_mjx, rays
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.evaluate.witness import load as witness_load
+from swarmjax.evaluate.trained_settings import load as load_as_trained
 from swarmjax.policy import Policy
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
@@ -114,7 +114,7 @@ def _with(judge: evaluate_judge.Judge, trained: Policy) -> evaluate_judge.Judge:
 
 def test_a_policy_is_judged_with_the_hearing_that_it_has(tmp_path: Path) -> None:
     path = _policy(tmp_path / "hears.npz")
-    settings, _ = witness_load(EvaluateConfig, [f"policy={path}"])
+    settings, _ = load_as_trained(EvaluateConfig, [f"policy={path}"])
     assert settings.task.neighbours.count == 2
 
 
@@ -125,7 +125,7 @@ def test_a_policy_is_judged_with_the_hearing_that_it_has(tmp_path: Path) -> None
 def test_another_hearing_is_refused(key: str, value: float, held: float, tmp_path: Path) -> None:
     path = _policy(tmp_path / "hears.npz")
     sentence = refusal(
-        lambda *words: witness_load(EvaluateConfig, words),
+        lambda *words: load_as_trained(EvaluateConfig, words),
         f"policy={path}",
         f"task.neighbours.{key}={value}",
     )
@@ -139,10 +139,10 @@ def test_another_hearing_is_refused(key: str, value: float, held: float, tmp_pat
 def test_a_policy_that_does_not_hear_is_not_made_to(tmp_path: Path) -> None:
     path = _policy(tmp_path / "deaf.npz", ["stage=s3"])
     with pytest.raises(ConfigError, match=r"task\.neighbours\.count is 2, but .* trained with 0"):
-        witness_load(EvaluateConfig, [f"policy={path}", "task.neighbours.count=2"])
+        load_as_trained(EvaluateConfig, [f"policy={path}", "task.neighbours.count=2"])
 
 
 def test_policies_that_hear_and_do_not_are_compared_each_with_its_own(tmp_path: Path) -> None:
     first, second = _policy(tmp_path / "a.npz"), _policy(tmp_path / "b.npz", ["stage=s3"])
-    settings, _ = witness_load(EvaluateConfig, [f"compare={first},{second}"])
+    settings, _ = load_as_trained(EvaluateConfig, [f"compare={first},{second}"])
     assert settings.task.neighbours.count == 2
