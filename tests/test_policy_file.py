@@ -135,6 +135,7 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
             r"meta.observation.neighbours.count is 0: expected a wh",
         ),
         (_HEARS, _heard(range=0), r"meta.observation.neighbours.range is 0: expected a number ab"),
+        (_HEARS, _heard(message_size=0), r"meta.observation.neighbours is .* without message_size"),
         (_HEARS, _heard(count=9), r"meta.observation.neighbours takes 36 entries, but m"),
         (_HEARS, _HEARD | {"format": 2}, r"meta.format is 2, but this version reads 5 only: "),
         (_HEARS, _HEARD | {"network": "mine"}, r"meta.observation.neighbours and meta.n"),

@@ -121,7 +121,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
 
 def neighbours(trained: Policy) -> NeighboursConfig:
-    """Returns a policy's settings for hearing and broadcasting."""
+    """Returns which neighbours a policy observes."""
     return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 

@@ -60,8 +60,7 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
     if "neighbours" in meta["observation"]:
-        held = meta["observation"]["neighbours"]
-        task["neighbours"] = {"count": held["count"], "range": held["range"]}
+        task["neighbours"] = meta["observation"]["neighbours"]
     return Trained(
         robot=build(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),

@@ -131,9 +131,8 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     if settings.format == "npz":
         outputs.write({out: content})
         return
-    trained_settings.trained(
-        meta, str(source)
-    )  # refuses numbers that the archive's reader leaves unchecked
+    # Refuses numbers that the archive's reader leaves unchecked.
+    trained_settings.trained(meta, str(source))
     check.expressible(meta, settings.format, settings.sensors)
     trained = policy_file.read(source)
     if settings.format == "onnx":

@@ -81,7 +81,9 @@ def _exactly(words: tuple[str, ...]) -> _Rule:
 
 
 _OBJECT = _Rule("an object", lambda value: isinstance(value, dict))
-_POSITIVE = _Rule("a number above 0", lambda value: _is_number(value) and np.float32(value) > 0)
+_POSITIVE = _Rule(
+    "a number above 0", lambda value: _is_number(value) and bool(np.float32(value) > 0)
+)
 _NAMED = _Rule("a name", lambda value: _is_word(value, _NAME))
 _FIELDS = {  # of `meta`; an object comes before what it holds
     "policy": _one_of("shared", "independent"),
@@ -109,7 +111,7 @@ _FIELDS = {  # of `meta`; an object comes before what it holds
     "observation.encoding": _one_of("metric", "webots"),
     "observation.limit": _Rule(
         f"a number above 0, at most {_MOST_LIMIT:g}",
-        lambda value: _POSITIVE.holds(value) and value <= _MOST_LIMIT,
+        lambda value: _POSITIVE.holds(value) and bool(value <= _MOST_LIMIT),
     ),
     "action": _OBJECT,
     "action.names": _exactly(ACTION_NAMES),
@@ -139,7 +141,10 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
         "memory.size": _whole(1, 1024),
     },
     "observation.neighbours": {
-        "observation.neighbours": _OBJECT,
+        "observation.neighbours": _Rule(
+            "an object without message_size, which c5cd6da is the last commit to read",
+            lambda value: _OBJECT.holds(value) and "message_size" not in value,
+        ),
         "observation.neighbours.count": _whole(1, 32),
         "observation.neighbours.range": _POSITIVE,
     },
@@ -285,16 +290,18 @@ def _shapes(
 ) -> dict[str, tuple[int, ...]]:
     """Returns the expected shape of each array; the width of a hidden layer is that of its bias."""
     learners, width = meta["learners"], len(meta["observation"]["names"])
-    shapes = {f"normalizer/{part}": (learners, width) for part in ("mean", "std")}
+    shapes: dict[str, tuple[int, ...]] = {
+        f"normalizer/{part}": (learners, width) for part in ("mean", "std")
+    }
 
     def add(layer: str, inputs: int, outputs: int | None = None) -> int:
         """Adds a layer and returns the number of its outputs."""
-        if outputs is None:
-            bias = arrays.get(f"actor/{layer}/bias", np.empty(0))
-            outputs = bias.shape[-1] if bias.ndim == 2 else 0
-        shapes[f"actor/{layer}/kernel"] = (learners, inputs, outputs)
-        shapes[f"actor/{layer}/bias"] = (learners, outputs)
-        return outputs
+        bias = arrays.get(f"actor/{layer}/bias", np.empty(0))
+        given: int = bias.shape[-1] if bias.ndim == 2 else 0
+        width = given if outputs is None else outputs
+        shapes[f"actor/{layer}/kernel"] = (learners, inputs, width)
+        shapes[f"actor/{layer}/bias"] = (learners, width)
+        return width
 
     depth, neighbours = _hidden_layers(arrays, meta), _neighbours(meta)
     if neighbours:
