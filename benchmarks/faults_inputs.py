@@ -24,7 +24,7 @@ from typing import Any
 from benchmarks import faults_policies
 from swarmjax.config import ConfigError, files, section, to_dict
 from swarmjax.config.section import Section
-from swarmjax.evaluate import cells, trials, witness
+from swarmjax.evaluate import cells, trained_settings, trials
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.suite_config import read_suite
@@ -63,7 +63,7 @@ def _train(words: Words) -> None:
 
 
 def _evaluate(words: Words) -> None:
-    settings, _ = witness.load(EvaluateConfig, words)
+    settings, _ = trained_settings.load(EvaluateConfig, words)
     for text in (settings.policy, settings.compare):
         if text is not None:
             trials.read_policies(list_files("policy", text), settings.extensions)
@@ -73,7 +73,7 @@ def _evaluate(words: Words) -> None:
 
 
 def _replay(words: Words) -> None:
-    settings, _ = witness.load(ReplayConfig, words)
+    settings, _ = trained_settings.load(ReplayConfig, words)
     trials.read_policies(settings.policies, settings.extensions)
 
 

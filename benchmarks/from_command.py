@@ -222,7 +222,7 @@ def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
     )
     policies = trials.read_policies([str(path)])
     (trial,) = trials.run(settings, cells.load(settings).cells, policies)
-    judged = float(np.mean(trial.found["targets_reached"]))
+    judged = float(np.mean(trial.measures["targets_reached"]))
     return {"judged": judged, "action": settings.action}
 
 

@@ -204,7 +204,7 @@ def evaluate_policy(
     Raises:
       SwarmjaxError: an argument is invalid, or does not fit the policy.
     """
-    from swarmjax.evaluate import evaluation, witness
+    from swarmjax.evaluate import evaluation, trained_settings
     from swarmjax.evaluate.config import EvaluateConfig
     from swarmjax.evaluate.trials import Entrant
 
@@ -219,7 +219,9 @@ def evaluate_policy(
     named = {"stage": stage, "suite": suite, "workers": workers, "extensions": word}
     given: dict[str, Any] = {**named, **settings}
     words, stages = _given({key: value for key, value in given.items() if value is not None})
-    config, _ = witness.load(EvaluateConfig, words, entrants, stages[0] if stages else None)
+    config, _ = trained_settings.load(
+        EvaluateConfig, words, entrants, stages[0] if stages else None
+    )
     return evaluation.judge_entrants(config, entrants).result
 
 

@@ -105,12 +105,9 @@ class Swarm:
 
     @property
     def action_space(self) -> Space:
-        """One robot's action, [U]: the command, clipped to -1..1, the ends of the command's range.
-
-        The numbers that a robot broadcasts, if any, follow the two numbers of the command.
-        """
+        """One robot's action, [U]: -1..1 spans the range of the command."""
         ones = np.ones(self.world.action_size, np.float32)
-        names, _ = policy_file.action_layout(self.world.electronics.neighbours.message_size)
+        names = policy_file.ACTION_NAMES
         return Space(ones.shape, names, ("1",) * len(names), -ones, ones)
 
     def pose(self, state: SwarmState) -> Array:

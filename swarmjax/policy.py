@@ -49,7 +49,7 @@ class Policy(NamedTuple):
 
     @property
     def neighbours(self) -> dict[str, Any]:
-        """Neighbour settings: `count`, `range` (m) and `message_size`; empty if not used."""
+        """Neighbour settings: `count` and `range` (m); empty if not used."""
         return self.meta["observation"].get("neighbours", {})
 
     @property
@@ -85,7 +85,7 @@ def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
             raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
         with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
-            arrays = _unpack(file)
+            arrays = unpack(file)
         said, text = _text(arrays, "digest"), _text(arrays, "meta")
         if sum(map(text.count, "[{,:")) > MAX_ENTRIES:
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
@@ -133,8 +133,8 @@ def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
     return zipfile.ZipFile(file)
 
 
-def _unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; refuses one that unpacks to more bytes than the file has."""
+def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
+    """Reads the arrays of an archive; refuses one that unpacks to more bytes than it has."""
     with open_archive(file) as archive:
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:
@@ -262,9 +262,7 @@ def command(policy: Policy, action: np.ndarray) -> np.ndarray:
     """Scales actions [..., U], clipped to -1..1, to commands.
 
     Returns:
-      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive). If robots send
-      messages, these follow, within -1..1.
+      [..., U]: speed, 0..max_speed (m/s), and turn rate (rad/s, left positive).
     """
-    speed, turn, *said = np.moveaxis(np.clip(action, -1, 1), -1, 0)
-    drive = [(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate]
-    return np.stack([*drive, *said], -1)
+    speed, turn = np.moveaxis(np.clip(action, -1, 1), -1, 0)
+    return np.stack([(speed + 1) * (0.5 * policy.max_speed), turn * policy.max_turn_rate], -1)

@@ -85,15 +85,6 @@ def test_a_command_replaces_its_own_output_and_on_request_any_file(name: str) ->
 
 
 @pytest.mark.usefixtures("folder")
-def test_a_folder_of_the_user_named_unfinished_stays() -> None:
-    main, words, _, _ = COMMANDS["evaluate folder"]
-    Path("judged/unfinished").mkdir(parents=True)
-    Path("judged/unfinished/mine.txt").write_text("mine")
-    assert main(words) == 0
-    assert [path.name for path in Path("judged/unfinished").iterdir()] == ["mine.txt"]
-
-
-@pytest.mark.usefixtures("folder")
 def test_a_suite_does_not_replace_a_policy() -> None:
     before = Path("policy.npz").read_bytes()
     assert "out is policy.npz" in refusal(suite.main, ["suite=mine.yaml", "out=policy.npz"])

@@ -99,7 +99,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @property
     def action_size(self) -> int:
-        """Size of the action of all robots: two numbers each, plus their messages."""
+        """Size of the action of all robots: two numbers each."""
         return self.robots.action_size * len(self.robots)
 
     @property

@@ -21,7 +21,6 @@ Examples:
 import json
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -29,7 +28,7 @@ from rich.progress import Progress
 
 from swarmjax import command, outputs
 from swarmjax.evaluate import table as evaluate_table
-from swarmjax.evaluate import unfinished, witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
@@ -42,52 +41,33 @@ _NAMES = ("result.json", "levels.csv", "measures.png", "times.png")
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings, said = witness.load(EvaluateConfig, arguments)
+    settings, said = trained_settings.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
-    keep = None if out is None else unfinished.place(out)
-    if out is not None and keep is not None:
-        written = [*_files(out), keep / unfinished.ABOUT]
-        outputs.check("out", written, overwrite=settings.overwrite)
+    if out is not None:
+        outputs.check("out", _files(out), overwrite=settings.overwrite)
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            found = evaluate(settings, progress, partial(_say, said, keep), keep)
+            evaluation = evaluate(settings, progress, lambda: _say(said))
     except KeyboardInterrupt:
-        sys.stderr.write(f"swarmjax.evaluate: interrupted, {_left(keep)}.\n")
+        sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
-    if out is not None and keep is not None:
-        limits = [specialise(settings, trial.cell).step_limit for trial in found.trials]
-        outputs.write(_content(out, found, max(limits) * settings.task.control_step))
-        unfinished.remove(keep)
+    if out is not None:
+        limits = [specialise(settings, trial.cell).step_limit for trial in evaluation.trials]
+        outputs.write(_content(out, evaluation, max(limits) * settings.task.control_step))
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
-    evaluate_table.show(console, found.result)
+    evaluate_table.show(console, evaluation.result)
     return 0
 
 
-def _say(sentence: str, keep: Path | None, done: int, cells: int) -> None:
-    """Prints which settings come from the policies, before judging starts.
-
-    Judging takes a minute.
-    """
+def _say(sentence: str) -> None:
+    """Prints which settings come from the policies, before judging, which takes a minute."""
     sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
-    if done:
-        sys.stdout.write(
-            f"swarmjax.evaluate: {done} of {cells} cells were judged before, in {keep}\n"
-        )
     sys.stdout.flush()
-
-
-def _left(keep: Path | None) -> str:
-    """Describes what an interrupted evaluation has saved."""
-    done = 0 if keep is None else unfinished.count(keep)
-    if not done:
-        return "nothing was written"
-    are = "1 cell is" if done == 1 else f"{done} cells are"
-    return f"{are} in {keep}, and the same command continues with the rest"
 
 
 def _files(out: Path) -> list[Path]:
@@ -95,17 +75,17 @@ def _files(out: Path) -> list[Path]:
     return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
-def _content(out: Path, found: Evaluation, limit: float) -> dict[Path, bytes]:
+def _content(out: Path, evaluation: Evaluation, limit: float) -> dict[Path, bytes]:
     """Makes the JSON file, or all files of a folder; `limit` is an episode's length, s."""
-    text = (json.dumps(found.result, indent=2, allow_nan=False) + "\n").encode()
+    text = (json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n").encode()
     if out.suffix == ".json":
         return {out: text}
-    levels = evaluate_table.levels(found.entrants, found.trials)
+    levels = evaluate_table.levels(evaluation.entrants, evaluation.trials)
     files = {"result.json": text, "levels.csv": levels.encode()}
-    if "policies" in found.result:
+    if "policies" in evaluation.result:
         from swarmjax.evaluate import figures  # Matplotlib takes a second to import
 
-        drawn = figures.png_files(found.result, found.trials, limit)
+        drawn = figures.png_files(evaluation.result, evaluation.trials, limit)
         files |= {f"{name}.png": content for name, content in drawn.items()}
     return {out / name: content for name, content in files.items()}
 

@@ -5,11 +5,10 @@ who draws the levels can check that every bit is the same. Levels of a suite are
 nominal e-puck.
 """
 
-import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from swarmjax import epuck, extension, policy
 from swarmjax.config import ConfigError, build, check_text, reading, show, to_dict
 from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.evaluate.suite_config import CellConfig, read_suite
+from swarmjax.evaluate.suite_config import CellConfig, SuiteFileConfig, read_suite
 from swarmjax.extension import LevelDrawing
 from swarmjax.outputs import replacing
 from swarmjax.task import level, shapes
@@ -27,13 +26,9 @@ from swarmjax.task.level import Level
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
-FORMAT = 1
-_NEWER = ("steps", "hull_friction")  # keys of a cell that files of the first version lack
+FORMAT = 2
 _TARGET_RADIUS = TaskConfig().target_radius
 _LARGEST_HALF = 2.5  # m, largest half edge of a box: longer than half the largest arena
-MAX_BYTES = 2**30  # bytes of all levels of a file; a thousand levels of s6 take 0.2 MB
-_LEAST_ROOM = 2**22  # bytes to which any file may unpack, plus `_PACKED` times its own size
-_PACKED = 20  # greatest factor by which packing may shrink a file; for random numbers it is 2
 
 
 class Cell(NamedTuple):
@@ -135,16 +130,16 @@ def draw(choice: str) -> Suite:
       ConfigError: The file is unsound, or a digest is missing or wrong.
     """
     file = read_suite(choice)
-    found = []
+    drawn = []
     for each in file.cells:
         if each.digest is None:
             raise ConfigError(
                 f"cell {each.name} of suite {file.name} has no digest: draw it with "
                 f"python -m swarmjax.suite suite={choice} write=true."
             )
-        found.append(draw_cell(each))
-        _check_digest(found[-1], each.digest, f"suite {file.name}")
-    return Suite(file.name, tuple(found))
+        drawn.append(draw_cell(each))
+        _check_digest(drawn[-1], each.digest, f"suite {file.name}")
+    return Suite(file.name, tuple(drawn))
 
 
 def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
@@ -168,7 +163,10 @@ def draw_cell(cell: CellConfig) -> Cell:
     """Draws the levels of a suite's cell, without checking the cell's digest."""
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
-    episodes = np.array(numbers)
+    return _cell(cell, np.array(numbers), levels)
+
+
+def _cell(cell: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
     about = (cell.name, cell.stage, cell.shape, cell.realism, cell.seed)
     return Cell(*about, episodes, levels, cell.steps, cell.hull_friction)
 
@@ -220,17 +218,16 @@ def write(path: Path, suite: Suite) -> None:
       ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
-    keys = ("name", "shape", "realism", "seed", "digest")
+    keys = ("name", "shape", "realism", "seed", "digest", "steps", "hull_friction")
     about = [
-        {"stage": to_dict(cell.stage), **{key: getattr(cell, key) for key in keys}}
-        # A file without these keys can be read by older versions.
-        | {key: value for key in _NEWER if (value := getattr(cell, key)) is not None}
+        {"stage": to_dict(cell.stage), "levels": len(cell.episodes)}
+        | {key: getattr(cell, key) for key in keys}
         for cell in suite.cells
     ]
     meta = json.dumps({"format": FORMAT, "suite": suite.name, "cells": about})
     try:
         with replacing(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
+            np.savez(file, allow_pickle=False, **{"meta": np.array(meta), **arrays})
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror or error}.") from None
 
@@ -249,73 +246,36 @@ def read(path: Path) -> Suite:
     """
     check_text("suite", str(path))
     try:
-        content = reading.read_bytes(path, MAX_BYTES)
-    except ConfigError as error:
-        raise ConfigError(f"suite {error}") from None
+        if path.exists() and not path.is_file():
+            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
+        with path.open("rb") as file:
+            arrays = policy.unpack(file)
+    except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise ConfigError(f"suite {path} cannot be read: {reason.rstrip('.')}.") from None
     try:
-        return _parse(_unpack(content))
+        return _parse(arrays)
     except ConfigError as error:
         raise ConfigError(f"suite {path}: {error}") from None
 
 
-def _unpack(content: bytes) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; refuses pickled arrays and archives that are too large."""
-    try:
-        with policy.open_archive(io.BytesIO(content)) as archive:
-            members = archive.infolist()
-            most = min(MAX_BYTES, _LEAST_ROOM + _PACKED * len(content))
-            if sum(each.file_size for each in members) > most:
-                raise ValueError(f"it unpacks to more than {most} bytes")
-            if len({each.filename for each in members}) < len(members):
-                raise ValueError("it holds a member twice")
-            return {
-                each.filename.removesuffix(".npy"): policy.read_array(archive, each)
-                for each in members
-            }
-    except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
-        reason = str(error).partition("\n")[0].rstrip(".") or type(error).__name__
-        raise ConfigError(f"it cannot be read: {reason}.") from None
-
-
 def _parse(arrays: dict[str, np.ndarray]) -> Suite:
-    meta = _parse_meta(arrays.pop("meta", None))
-    cells = [_parse_cell(about, arrays) for about in meta["cells"]]
-    if arrays:
-        raise ConfigError(f"{sorted(arrays)[0]} is unknown: meta.cells lists no such cell.")
-    return Suite(str(meta["suite"]), tuple(cells))
-
-
-def _parse_meta(array: np.ndarray | None) -> dict[str, Any]:
-    """Reads the file's description of itself."""
     try:
-        meta = reading.parse_json(str(array), "meta")
+        meta = reading.parse_json(str(arrays.pop("meta", None)), "meta")
     except ConfigError:
-        raise ConfigError(
-            "meta is missing or not JSON: this is not a suite of this project."
-        ) from None
+        meta = None
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         raise ConfigError(f"meta.format is not {FORMAT}: this version cannot read the suite.")
-    cells = meta.get("cells")
-    if not isinstance(meta.get("suite"), str) or not isinstance(cells, list) or not cells:
-        raise ConfigError("meta.suite or meta.cells is missing: give a name and a list.")
-    names = [cell.get("name") if isinstance(cell, dict) else None for cell in cells]
-    if len(set(map(str, names))) < len(names):
-        raise ConfigError("meta.cells names a cell more than once: give each name once.")
-    return meta
+    file = build(SuiteFileConfig, {"name": meta.get("suite"), "cells": meta.get("cells")}, "meta.")
+    suite = Suite(file.name, tuple(_parse_cell(cell, arrays) for cell in file.cells))
+    if arrays:
+        raise ConfigError(f"{sorted(arrays)[0]} is unknown: meta.cells lists no such cell.")
+    return suite
 
 
-def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell:
+def _parse_cell(cell: CellConfig, arrays: dict[str, np.ndarray]) -> Cell:
     """Takes a cell's arrays from the file's arrays."""
-    if not isinstance(about, Mapping):
-        raise ConfigError(f"meta.cells holds {show(about)}: give keys and values.")
-    name = str(about.get("name"))
-    numbers = arrays.get(f"{name}/episode")
-    # The same checks as for a suite's file.
-    size = 0 if numbers is None else numbers.size
-    cell = build(CellConfig, {"levels": size, **about}, f"cell {name}: ")
-    if cell.digest is None:
-        raise ConfigError(f"cell {name}: digest is missing.")
-    count, robots = cell.levels, cell.stage.robots
+    name, count, robots = cell.name, cell.levels, cell.stage.robots
     boxes = arrays.get(f"{name}/obstacle")
     obstacles = boxes.shape[1] if boxes is not None and boxes.ndim == 3 else 0
     expected = {
@@ -329,13 +289,13 @@ def _parse_cell(about: Mapping[str, Any], arrays: dict[str, np.ndarray]) -> Cell
         "seed": (np.uint32, (count,)),
     }
     fields = {key: _take(arrays, f"{name}/{key}", *form) for key, form in expected.items()}
-    episodes = fields.pop("episode")
-    levels = Level(**fields)
+    episodes, levels = fields.pop("episode"), Level(**fields)
     _check_levels(name, levels, cell.stage)
-    about_it = (name, cell.stage, cell.shape, cell.realism, cell.seed)
-    found = Cell(*about_it, episodes, levels, cell.steps, cell.hull_friction)
-    _check_digest(found, cell.digest, "the file")
-    return found
+    read = _cell(cell, episodes, levels)
+    if cell.digest is None:
+        raise ConfigError(f"cell {name}: digest is missing.")
+    _check_digest(read, cell.digest, "the file")
+    return read
 
 
 def _take(

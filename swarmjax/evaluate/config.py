@@ -16,7 +16,7 @@ from swarmjax.task.stage_config import StageConfig
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
 STEPS = 1500  # control steps of an episode by default; Table 1
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
-# Values that `witness.load` takes from the policies.
+# Values that `trained_settings.load` takes from the policies.
 AS_TRAINED = {
     "stage": "its last stage",
     "robot": "as trained, on wheels",

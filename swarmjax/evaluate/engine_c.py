@@ -169,7 +169,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     outcome = _no_outcome(len(levels), judge.spacing.robots)
     sight = look(judge, data, factors, pose, target, obstacle)
     sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
-    sight = _hear(judge, data, sight, pose, obstacle, None)
+    sight = _hear(judge, data, sight, pose, obstacle)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -286,7 +286,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
             raise PolicyError("the policy has a memory: pass the action that `ByPolicy` chooses.")
         _, action = ByPolicy(judge).act(None, arenas)
     active = arrival.drives(task.arrival, before)
-    memory, pose, impulse = _drive(judge, arenas, action[..., : sim_drive.COMMAND_SIZE], active)
+    memory, pose, impulse = _drive(judge, arenas, action, active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = contacts.touching(judge, arenas.data)
@@ -294,8 +294,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
     sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
-    said = hearing.broadcast(action, judge.electronics.neighbours.message_size, active, np)
-    sight = _hear(judge, arenas.data, sight, pose, arenas.obstacle, said)
+    sight = _hear(judge, arenas.data, sight, pose, arenas.obstacle)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     step = _Step(arrived, begins, touches, impulse, sight.ray < task.sensor_range)
     anchor, outcome = _tally(arenas, pose, step)
@@ -324,15 +323,14 @@ def _hear(
     sight: Sight,
     pose: np.ndarray,
     obstacle: np.ndarray,
-    said: np.ndarray | None,
 ) -> Sight:
-    """Adds the neighbours in range and their messages [A, R, M]; None: no messages yet."""
+    """Adds the neighbours in range."""
     settings = judge.electronics.neighbours
     if not settings.count:
         return sight
     hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
     present = np.ones(pose.shape[:2], bool)  # in the judge no robot is absent
-    return sight._replace(heard=hearing.reachable(pose, present, hidden, said, settings, np))
+    return sight._replace(heard=hearing.reachable(pose, present, hidden, settings, np))
 
 
 class _Step(NamedTuple):

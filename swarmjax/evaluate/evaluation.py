@@ -1,18 +1,17 @@
 """Judges policies on the levels of a suite or a stage, and summarises the outcome."""
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable
 from functools import partial
 from glob import glob
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.progress import Progress
 
 from swarmjax.config import ConfigError, show
-from swarmjax.evaluate import cells, judge, summary, unfinished
+from swarmjax.evaluate import cells, judge, summary
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.cells import Cell, Suite
+from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial
 
@@ -34,30 +33,25 @@ class Evaluation(NamedTuple):
 def evaluate(
     settings: EvaluateConfig,
     progress: Progress | None = None,
-    announce: Callable[[int, int], object] = lambda *_: None,
-    keep: Path | None = None,
+    announce: Callable[[], object] = lambda: None,
 ) -> Evaluation:
     """Judges policies.
 
     Args:
       settings: Settings of the evaluation.
       progress: Progress display; None shows nothing.
-      announce: Called before the first episode, once all inputs are checked. Its arguments are the
-        number of cells already judged and the number of all cells.
-      keep: Folder to save each finished cell in, from which the same evaluation resumes; None
-        saves nothing.
+      announce: Called before the first episode, once all inputs are checked.
 
     Returns:
       The findings.
 
     Raises:
       PolicyError: A policy is unsound, or does not fit the levels.
-      ConfigError: A file is missing, a suite is unsound, the physics breaks down, or the saved
-        cells belong to another evaluation.
+      ConfigError: A file is missing, a suite is unsound, or the physics breaks down.
     """
     files = _sides(settings)
     sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
-    return _judge(settings, sides, progress or Progress(disable=True), announce, keep)
+    return _judge(settings, sides, progress or Progress(disable=True), announce)
 
 
 def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
@@ -74,15 +68,14 @@ def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluat
       PolicyError: A policy does not fit the levels.
       ConfigError: A suite is unsound, or the physics breaks down.
     """
-    return _judge(settings, [entrants], Progress(disable=True), lambda *_: None, None)
+    return _judge(settings, [entrants], Progress(disable=True), lambda: None)
 
 
 def _judge(
     settings: EvaluateConfig,
     sides: list[list[Entrant]],
     progress: Progress,
-    announce: Callable[[int, int], object],
-    keep: Path | None,
+    announce: Callable[[], object],
 ) -> Evaluation:
     """Judges the policies of one side, or of two sides for a comparison."""
     entrants = [each for side in sides for each in side]
@@ -90,33 +83,11 @@ def _judge(
         for path, trained in entrants:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
-    judged = unfinished.about(settings, suite.cells, entrants) if keep else {}
-    done = unfinished.read(keep, judged, suite.cells) if keep else {}
-    announce(len(done), len(suite.cells))
-    report, report_cell = _show_bars(progress, suite.cells, done, len(entrants))
-    left = {row: cell for row, cell in enumerate(suite.cells) if row not in done}
-    trials = evaluate_trials.run(settings, list(left.values()), entrants, report)
-    for row, trial in zip(left, trials, strict=True):
-        done[row] = trial
-        if keep:
-            unfinished.write(keep, judged, row, trial)
-        report_cell(1)
-    trials = [done[row] for row in range(len(suite.cells))]
+    announce()
+    total = sum(len(entrants) * len(cell.episodes) for cell in suite.cells)
+    report = partial(progress.advance, progress.add_task("episodes", total=total))
+    trials = list(evaluate_trials.run(settings, suite.cells, entrants, report))
     return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
-
-
-def _show_bars(
-    progress: Progress, all_cells: Sequence[Cell], done: Collection[int], policies: int
-) -> tuple[Callable[[int], None], Callable[[int], None]]:
-    """Shows the progress; returns functions that count finished episodes and cells."""
-    episodes = [policies * len(cell.episodes) for cell in all_cells]
-    before = sum(episodes[row] for row in done)
-    bars = (
-        progress.add_task("episodes", total=sum(episodes), completed=before),
-        progress.add_task("cells", total=len(all_cells), completed=len(done)),
-    )
-    first, second = (partial(progress.advance, bar) for bar in bars)
-    return first, second
 
 
 def _sum_up(
@@ -132,8 +103,8 @@ def _sum_up(
 
 def _rows(trial: Trial, rows: slice) -> Trial:
     """Keeps some of the policies of a trial."""
-    found = {name: table[rows] for name, table in trial.found.items()}
-    return trial._replace(found=found, arrival=trial.arrival[rows])
+    tables = {name: table[rows] for name, table in trial.measures.items()}
+    return trial._replace(measures=tables, arrival=trial.arrival[rows])
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:
@@ -168,13 +139,13 @@ def list_files(key: str, text: str) -> list[str]:
     Raises:
       ConfigError: A pattern matches nothing, or a file is named twice.
     """
-    found: list[str] = []
+    files: list[str] = []
     for part in [text] if os.path.isfile(text) else text.split(","):
         matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
         if not matches or not part:
             raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
-        found += matches
-    for file in found:
-        if found.count(file) > 1:
+        files += matches
+    for file in files:
+        if files.count(file) > 1:
             raise ConfigError(f"{key} is {show(text)}, which names {file} twice: give it once.")
-    return found
+    return files

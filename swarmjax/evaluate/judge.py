@@ -121,7 +121,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
 
 def neighbours(trained: Policy) -> NeighboursConfig:
-    """Returns a policy's settings for hearing and broadcasting."""
+    """Returns which neighbours a policy observes."""
     return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 
@@ -204,11 +204,11 @@ def check_policy(
     layout = trained.meta["observation"]
     own = _observations(extensions, trained)
     for key, expected in observation.describe(trained.encoding, own, neighbours(trained)).items():
-        found = layout.get(key)
-        if found != expected:
+        given = layout.get(key)
+        if given != expected:
             raise PolicyError(
                 f"{path} was trained on observations that differ from this robot's: its "
-                f"meta.observation.{key} is {_list(found)}, expected {_list(expected)}."
+                f"meta.observation.{key} is {_list(given)}, expected {_list(expected)}."
             )
     learners = len(trained.log_std)
     if not trained.is_shared and stage.robots > learners:

@@ -104,7 +104,7 @@ def per_level(
     """
     late = ~outcome.arrived
     arrival = np.where(late, steps, outcome.arrival) * control_step
-    found = {
+    values = {
         "targets_reached": outcome.arrived.mean(axis=-1),
         "all_reached": outcome.arrived.all(axis=-1).astype(float),
         "time_to_reach_s": arrival.mean(axis=-1),
@@ -116,10 +116,10 @@ def per_level(
         **_split("contact_s", outcome.touched * control_step),
     }
     if not np.isnan(outcome.impulse).any():
-        found |= _split("impulse_ns", outcome.impulse)
+        values |= _split("impulse_ns", outcome.impulse)
     if shortest is not None:
-        found["spl"] = _efficiency(outcome, shortest).mean(axis=-1)
-    return {name: found[name].astype(float) for name in MEASURES if name in found}
+        values["spl"] = _efficiency(outcome, shortest).mean(axis=-1)
+    return {name: values[name].astype(float) for name in MEASURES if name in values}
 
 
 def _split(name: str, values: np.ndarray) -> dict[str, np.ndarray]:

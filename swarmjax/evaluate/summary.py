@@ -18,7 +18,7 @@ from swarmjax.evaluate.statistics import LEAST_DRAWN, Draw, Interval, Statistic
 from swarmjax.evaluate.trials import Entrant, Trial, specialise
 
 WORST = 0.05  # share of the levels that CVaR averages
-Found = Mapping[str, np.ndarray]
+Measured = Mapping[str, np.ndarray]
 
 
 def result(
@@ -39,7 +39,7 @@ def result(
         **_about(config, suite),
         "policies": [{"path": each.path, "digest": each.policy.digest} for each in entrants],
         "cells": [
-            about_cell(config, trial) | {"measures": summarize(trial.found)} for trial in trials
+            about_cell(config, trial) | {"measures": summarize(trial.measures)} for trial in trials
         ],
         "pooled": _pool(trials),
     }
@@ -70,7 +70,7 @@ def comparison(
             for side in entrants
         ],
         "cells": [
-            about_cell(config, a) | {"measures": compare(a.found, b.found)} for a, b in pairs
+            about_cell(config, a) | {"measures": compare(a.measures, b.measures)} for a, b in pairs
         ],
         "pooled": _pool(*trials),
     }
@@ -114,11 +114,11 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
     }
 
 
-def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
+def summarize(measured: Measured, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
     """Summarises measures.
 
     Args:
-      found: Values [P, E] of each measure, from policies of one recipe on the same levels.
+      measured: Values [P, E] of each measure, from policies of one recipe on the same levels.
       strata: Sizes of groups of consecutive levels; levels are drawn within each group.
 
     Returns:
@@ -126,7 +126,7 @@ def summarize(found: Found, strata: Sequence[int] | None = None) -> dict[str, di
       policies). Each of the three has an interval, under its name with `_interval` appended. The
       interval is null if there are too few values.
     """
-    return {name: _summary(table, MEASURES[name], strata) for name, table in found.items()}
+    return {name: _summary(table, MEASURES[name], strata) for name, table in measured.items()}
 
 
 def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) -> dict[str, Any]:
@@ -135,14 +135,14 @@ def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) 
         "iqm": statistics.iqm,
         "cvar": partial(statistics.cvar, share=WORST, lowest=measure.is_good),
     }
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for name, statistic in of.items():
-        found[name] = float(statistic(table, axis=(0, 1)))
-        found[f"{name}_interval"] = None
+        figures[name] = float(statistic(table, axis=(0, 1)))
+        figures[f"{name}_interval"] = None
         if _are_enough(table, strata):
             drawn = statistics.bootstrap(table, statistic, draw=_draw(table), strata=strata)
-            found[f"{name}_interval"] = [drawn.low, drawn.high]
-    return found
+            figures[f"{name}_interval"] = [drawn.low, drawn.high]
+    return figures
 
 
 def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
@@ -158,9 +158,9 @@ def _draw(table: np.ndarray) -> Draw:
     return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
 
 
-def _join(found: Sequence[Found]) -> dict[str, np.ndarray]:
+def _join(tables: Sequence[Measured]) -> dict[str, np.ndarray]:
     """Joins the levels of all cells, for measures that all cells have."""
-    return {name: np.concatenate([each[name] for each in found], axis=1) for name in found[0]}
+    return {name: np.concatenate([each[name] for each in tables], axis=1) for name in tables[0]}
 
 
 def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
@@ -173,10 +173,10 @@ def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
     if len(cells) < 2 or any(_share(*pair) for pair in combinations(cells, 2)):
         return None
     strata = [len(cell.episodes) for cell in cells]
-    found = [_join([trial.found for trial in side]) for side in sides]
-    if len(found) > 1:
-        return {"episodes": sum(strata), "measures": compare(found[0], found[1], strata)}
-    return {"episodes": sum(strata), "measures": summarize(found[0], strata)}
+    tables = [_join([trial.measures for trial in side]) for side in sides]
+    if len(tables) > 1:
+        return {"episodes": sum(strata), "measures": compare(tables[0], tables[1], strata)}
+    return {"episodes": sum(strata), "measures": summarize(tables[0], strata)}
 
 
 def _share(a: Cell, b: Cell) -> bool:
@@ -185,7 +185,9 @@ def _share(a: Cell, b: Cell) -> bool:
     return alike and bool(np.isin(a.episodes, b.episodes).any())
 
 
-def compare(a: Found, b: Found, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
+def compare(
+    a: Measured, b: Measured, strata: Sequence[int] | None = None
+) -> dict[str, dict[str, Any]]:
     """Compares two recipes level by level.
 
     Args:
@@ -206,9 +208,9 @@ def _comparison(
     name: str, a: np.ndarray, b: np.ndarray, strata: Sequence[int] | None
 ) -> dict[str, Any]:
     better, worse = (b, a) if MEASURES[name].is_good else (a, b)
-    found: dict[str, Any] = {"a": float(a.mean()), "b": float(b.mean())}
+    figures: dict[str, Any] = {"a": float(a.mean()), "b": float(b.mean())}
     if not _are_enough(a, strata):
-        return found
+        return figures
     paired = partial(statistics.paired, a, b, draw=_draw(a), strata=strata)
     chance = statistics.probability_of_improvement(better, worse, draw=_draw(a), strata=strata)
     parts: dict[str, Interval[float]] = {
@@ -217,5 +219,5 @@ def _comparison(
         "improvement": chance,
     }
     for key, (estimate, low, high) in parts.items():
-        found |= {key: estimate, f"{key}_interval": [low, high]}
-    return found
+        figures |= {key: estimate, f"{key}_interval": [low, high]}
+    return figures

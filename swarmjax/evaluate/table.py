@@ -144,7 +144,7 @@ def levels(entrants: Sequence[Entrant], trials: Sequence[Trial]) -> str:
       entrants: The policies, in the order of the trials' rows.
       trials: Their results, one for each cell.
     """
-    names, text = [name for name in MEASURES if name in trials[0].found], io.StringIO()
+    names, text = [name for name in MEASURES if name in trials[0].measures], io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["cell", "episode", "policy", "unreachable", *names])
     for trial in trials:
@@ -157,6 +157,6 @@ def _rows(
 ) -> Iterator[list[object]]:
     lost = (trial.shortest == float("inf")).sum(axis=-1).tolist()
     for i, entrant in enumerate(entrants):
-        table = zip(*(trial.found[name][i].tolist() for name in names), strict=True)
+        table = zip(*(trial.measures[name][i].tolist() for name in names), strict=True)
         for number, missing, values in zip(trial.cell.episodes, lost, table, strict=True):
             yield [trial.cell.name, int(number), entrant.path, missing, *values]

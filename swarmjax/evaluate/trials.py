@@ -40,13 +40,13 @@ class Trial(NamedTuple):
     Attributes:
       cell: Cell with E levels.
       shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
-      found: [P, E] of each measure that the engine computes.
+      measures: [P, E] of each measure that the engine computes.
       arrival: [P, E, R] when robots arrived, s; inf if they did not.
     """
 
     cell: Cell
     shortest: np.ndarray
-    found: dict[str, np.ndarray]
+    measures: dict[str, np.ndarray]
     arrival: np.ndarray
 
 
@@ -149,8 +149,8 @@ def _try(
     second = config.task.control_step
     rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
     arrival = [np.where(each.arrived, each.arrival * second, np.inf) for each in outcomes]
-    found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return Trial(cell, shortest, found, np.stack(arrival))
+    tables = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return Trial(cell, shortest, tables, np.stack(arrival))
 
 
 def _by_mjx(

@@ -26,7 +26,7 @@ from pathlib import Path
 
 from swarmjax import command, outputs, policy_file
 from swarmjax.config import ConfigError, files
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.export import c, check, onnx, webots
 from swarmjax.export.config import ExportConfig
 from swarmjax.run import checkpoint
@@ -142,7 +142,8 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     if settings.format == "npz":
         outputs.write({out: content})
         return
-    witness.trained(meta, str(source))  # refuses numbers that the archive's reader leaves unchecked
+    # Refuses numbers that the archive's reader leaves unchecked.
+    trained_settings.trained(meta, str(source))
     check.expressible(meta, settings.format, settings.sensors)
     trained = policy_file.read(source)
     if settings.format == "onnx":

@@ -22,10 +22,6 @@ _ACTIVATIONS = {
     "swish": "0.5f * x[i] * (1.0f + tanhf(0.5f * x[i]))",
 }
 
-_SAID_CODE = """    for (unsigned i = 2; i < POLICY_ACTIONS; i++) {
-        command[i] = clip(action[i], 1.0f);
-    }
-"""
 _MEMORY_RESET = """        if (i % (CASES / 2) < POLICY_LEARNERS) {
             policy_begin(&memory[i % POLICY_LEARNERS]);
         }
@@ -92,7 +88,7 @@ def _sizes(trained: Policy) -> list[int]:
 
 
 def _first(trained: Policy) -> int:
-    """Returns the first entry about neighbours, for a policy with neighbour messages."""
+    """Returns the first entry about neighbours, for a policy that observes neighbours."""
     assert trained.hearing is not None  # checked by the callers
     return trained.mean.shape[1] - trained.neighbours["count"] * trained.hearing[0].shape[1]
 
@@ -104,14 +100,13 @@ def _widest(trained: Policy) -> int:
 
 
 def _hearing(trained: Policy) -> dict[str, Any]:
-    """Returns the code about neighbours; empty for a policy without neighbour messages."""
-    said = _SAID_CODE if trained.log_std.shape[1] > 2 else ""
+    """Returns the code about neighbours; empty for a policy that observes none."""
     if trained.hearing is None:
-        return {"hearing_code": "", "hearing_call": "", "said": said}
+        return {"hearing_code": "", "hearing_call": ""}
     _, row, width = trained.hearing[0].shape
     sizes = {"row": row, "width": width, "count": trained.neighbours["count"]}
     code = _fill("hearing.c", sizes | {"first": _first(trained)})
-    return {"hearing_code": code, "hearing_call": "    hear(learner, a);\n", "said": said}
+    return {"hearing_code": code, "hearing_call": "    hear(learner, a);\n"}
 
 
 def _memory(trained: Policy) -> dict[str, Any]:

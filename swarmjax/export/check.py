@@ -31,7 +31,7 @@ def expressible(meta: Mapping[str, Any], form: str, sensors: str) -> None:
         return
     if "neighbours" in meta["observation"]:
         raise PolicyError(
-            "format is webots, but the policy uses neighbour messages, and the controller has no "
+            "format is webots, but the policy observes neighbours, and the controller has no "
             "board for range and bearing: give format=c or onnx, and your own controller."
         )
     known = webots_controller.QUANTITIES

@@ -5,12 +5,11 @@
 """
 
 from swarmjax.policy_file.archive import read, read_meta, write
-from swarmjax.policy_file.fields import ACTION_NAMES, ACTION_UNITS, action_layout, check
+from swarmjax.policy_file.fields import ACTION_NAMES, ACTION_UNITS, check
 
 __all__ = [
     "ACTION_NAMES",
     "ACTION_UNITS",
-    "action_layout",
     "check",
     "read",
     "read_meta",

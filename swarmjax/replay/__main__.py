@@ -29,8 +29,8 @@ from rich.progress import Progress
 
 from swarmjax import command, outputs
 from swarmjax.config import ConfigError
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate import witness
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
@@ -41,7 +41,7 @@ from swarmjax.replay.episodes import replay
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
-    settings, said = witness.load(ReplayConfig, arguments)
+    settings, said = trained_settings.load(ReplayConfig, arguments)
     entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
     out, video = Path(settings.out), settings.video and Path(settings.video)
     _check_output("out", out, ".html", settings)

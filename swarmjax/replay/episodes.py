@@ -79,7 +79,7 @@ def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
     """
     picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
     reached, contacts, time = (
-        np.concatenate([each.found[name][0] for each in trials])
+        np.concatenate([each.measures[name][0] for each in trials])
         for name in ("targets_reached", "contacts_per_robot", "episode_time_s")
     )
     return [picks[i] for i in np.lexsort([-time, -contacts, reached])[:count]]

@@ -67,8 +67,6 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     chosen = pieces.choose(extension.load(trained.extensions), trained.task, trained.stage)
     heard = trained.task.neighbours
     described = observation.describe(encoding, chosen.observations, heard)
-    names, units = policy_file.action_layout(heard.message_size)
-    said = [1.0] * heard.message_size
     algo = trained.algo
     optional: dict[str, Any] = {"network": algo.network} if _has_own_network(algo) else {}
     if algo.memory != "none":
@@ -79,10 +77,10 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         "activation": algo.activation,
         "observation": described | {"limit": normalizer.OBSERVATION_LIMIT},
         "action": {
-            "names": list(names),
-            "units": list(units),
-            "low": [0.0, -robot.max_turn_rate, *(-x for x in said)],
-            "high": [robot.max_speed, robot.max_turn_rate, *said],
+            "names": list(policy_file.ACTION_NAMES),
+            "units": list(policy_file.ACTION_UNITS),
+            "low": [0.0, -robot.max_turn_rate],
+            "high": [robot.max_speed, robot.max_turn_rate],
         },
         "robot": {
             "preset": files.preset_of("robot", robot),

@@ -185,7 +185,7 @@ class TrainConfig(ProgramConfig):
             )
 
     def _check_hearing(self) -> None:
-        """Refuses options that a network with neighbour messages does not support."""
+        """Refuses options that a network that observes neighbours does not support."""
         count = self.task.neighbours.count
         if count and self.algo.update_backend == "fused":
             raise ConfigError(

@@ -25,7 +25,6 @@ from swarmjax.training.loop import TrainState
 
 _EXPLORED = "learners/explored"  # only where exploration is scheduled
 _MET = "curriculum/met"  # how many robots have trained
-_HEARING = ("count", "message_size")
 _CARRIED = ("learners/params/", "learners/normalizer/", _EXPLORED, _MET)
 
 
@@ -118,10 +117,10 @@ def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
 
 def _networks(settings: TrainConfig) -> dict[str, str]:
     """Returns the settings that runs with the same networks share, by key."""
-    algo, neighbours = settings.algo, settings.task.neighbours
+    algo = settings.algo
     found = {f"algo.{key}": getattr(algo, key) for key in NETWORK_KEYS if key != "network"}
     if algo.policy == "independent":
         found["sim.max_robots"] = settings.sim.max_robots
-    found |= {f"task.neighbours.{key}": getattr(neighbours, key) for key in _HEARING}
+    found["task.neighbours.count"] = settings.task.neighbours.count
     found["task.encoding"] = resolve_encoding(settings.task, settings.realism)
     return {key: show(value, quote="") for key, value in found.items()}

@@ -12,6 +12,7 @@ from swarmjax.task.arrival import Arrival
 
 # The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
+NEIGHBOUR_SIZE = 4  # observation entries of a neighbour: presence, distance, cosine, sine
 
 
 def _weight(meaning: str) -> dict[str, Any]:
@@ -51,37 +52,20 @@ class RewardConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class NeighboursConfig(Section):
-    """What a robot receives from other robots: range, bearing and broadcast numbers."""
+    """What a robot receives from other robots: range and bearing."""
 
-    count: int = field(
-        default=0, metadata=about("nearest neighbours observed; 0: no neighbour messages", 0, 32)
-    )
+    count: int = field(default=0, metadata=about("nearest neighbours observed; 0: none", 0, 32))
     range: float = field(
         # AutoMoDe's reference models use a range-and-bearing board. We assume the range of that
         # board.
         default=0.7,
         metadata=about("between centres, m", above=0.0, high=10.0),
     )
-    message_size: int = field(
-        default=0, metadata=about("numbers that a robot broadcasts per control step", 0, 32)
-    )
-
-    @property
-    def width(self) -> int:
-        """Observation entries per neighbour, W; 0 without neighbour messages."""
-        return 4 + self.message_size if self.count else 0
 
     @property
     def size(self) -> int:
-        """Observation entries for all neighbours, K W."""
-        return self.count * self.width
-
-    def _check(self) -> None:
-        if self.message_size and not self.count:
-            raise ConfigError(
-                f"message_size is {self.message_size}, but count is 0, so no robot receives "
-                "messages: give a count of 1 or more, or message_size=0."
-            )
+        """Observation entries for all neighbours."""
+        return self.count * NEIGHBOUR_SIZE
 
 
 @dataclass(frozen=True, kw_only=True)

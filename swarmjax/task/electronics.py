@@ -1,6 +1,6 @@
 """A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
 
-Motors, sensors and messages connect the policy to the arena. This module applies the realism
+Motors and sensors connect the policy to the arena. This module applies the realism
 factors to them, both in training and in evaluation. A factor that is off has no effect. With all
 factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
 """
@@ -40,7 +40,7 @@ class Electronics:
       sensor_range: largest infrared distance that is observed, m.
       control_step: s.
       own: observations of an extension, placed after the built-in ones.
-      neighbours: which neighbour messages are observed.
+      neighbours: which neighbours are observed.
     """
 
     realism: RealismConfig
@@ -91,7 +91,7 @@ class Sight(NamedTuple):
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
-      heard: neighbours within reach; None without neighbour messages.
+      heard: neighbours within reach; None if robots do not observe neighbours.
     """
 
     ray: Array

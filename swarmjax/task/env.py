@@ -54,7 +54,7 @@ class World:
       physics: the compiled physics.
       spacing: sizes that levels are drawn with.
       drive: the robot's drive.
-      electronics: the motors, sensors and messages between policy and arena.
+      electronics: the motors and sensors between policy and arena.
       terms: reward terms of an extension, with their weights.
       drawings: level drawings of an extension.
     """
@@ -76,8 +76,8 @@ class World:
 
     @property
     def action_size(self) -> int:
-        """Size of an action, U: the command, followed by the broadcast numbers."""
-        return sim_drive.COMMAND_SIZE + self.electronics.neighbours.message_size
+        """Size of an action, U."""
+        return sim_drive.COMMAND_SIZE
 
 
 @struct.dataclass
@@ -218,7 +218,7 @@ def reset(world: World, level: Level) -> EnvState:
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
     factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
-    sight = _look(world, level.start, level, factors, None)
+    sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     return EnvState(
@@ -281,7 +281,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     active = level.present & arrival.drives(world.task.arrival, state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    sight = _look(world, pose, level, state.factors, _speak(world, action, active))
+    sight = _look(world, pose, level, state.factors)
     rule, within = world.task.arrival, active & (sight.distance <= world.task.target_radius)
     arrived = arrival.arrived(rule, state.arrived, within)
     arrives = arrival.arrives(rule, state.arrived, arrived, level.present)
@@ -391,8 +391,8 @@ def _move(
     return data, memory, jnp.where(sound, after, before), sound
 
 
-def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array | None) -> Sight:
-    """Computes the sensor quantities at poses [R, 3], after robots broadcast numbers [R, M]."""
+def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
+    """Computes the sensor quantities at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
     mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
@@ -404,7 +404,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors, said: Array
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return _hear(world, Sight(ray, bright, distance, bearing), pose, level, said)
+    return _hear(world, Sight(ray, bright, distance, bearing), pose, level)
 
 
 def _look_by_extension(
@@ -417,19 +417,13 @@ def _look_by_extension(
     return sight._replace(own=extended.look(world.electronics.own, view))
 
 
-def _speak(world: World, action: Array, active: Array) -> Array | None:
-    """Extracts the broadcast numbers [R, M] from actions [R, U]; None without any."""
-    size = world.electronics.neighbours.message_size
-    return hearing.broadcast(action, size, active, jnp) if size else None
-
-
-def _hear(world: World, sight: Sight, pose: Array, level: Level, said: Array | None) -> Sight:
-    """Adds neighbours in reach at poses [R, 3]; broadcasts [R, M] are None at the start."""
+def _hear(world: World, sight: Sight, pose: Array, level: Level) -> Sight:
+    """Adds neighbours in reach at poses [R, 3]."""
     settings = world.electronics.neighbours
     if not settings.count:
         return sight
     hidden = hearing.hidden(pose, level.obstacle, jnp)
-    found = hearing.reachable(pose, level.present, hidden, said, settings, jnp)
+    found = hearing.reachable(pose, level.present, hidden, settings, jnp)
     return sight._replace(heard=found)
 
 

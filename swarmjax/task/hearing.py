@@ -1,6 +1,6 @@
-"""Range and bearing of neighbours, and the numbers that they broadcast.
+"""Range and bearing of neighbours.
 
-A robot receives a neighbour's distance, its bearing, and the few numbers of its packet. The model
+A robot receives a neighbour's distance and its bearing. The model
 follows the e-puck's infrared board for local communication (Gutiérrez et al. 2009, "Open E-puck
 Range & Bearing miniaturized board for local communication in swarm robotics") and AutoMoDe's
 reference models. Inner walls and boxes block reception; other robots do not. The code runs on NumPy
@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax.sim import infrared, noise
-from swarmjax.sim.drive import COMMAND_SIZE
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task.config import NeighboursConfig
+from swarmjax.task.config import NEIGHBOUR_SIZE, NeighboursConfig
 from swarmjax.task.nearest import nearest
 
 Array = Any
@@ -28,19 +27,16 @@ class Heard(NamedTuple):
       distance: [..., R, R] distance from the receiver (first axis of the two) to the sender, m; inf
         without reception.
       bearing: [..., R, R] bearing of the sender, from the receiver's x axis, rad.
-      message: [..., R, M] numbers that each robot broadcast in the last control step, -1..1.
     """
 
     distance: Array
     bearing: Array
-    message: Array
 
 
 def reachable(
     pose: Array,
     present: Array,
     hidden: Array,
-    message: Array | None,
     settings: NeighboursConfig,
     xp: Any,
 ) -> Heard:
@@ -50,15 +46,12 @@ def reachable(
       pose: [..., R, 3] x (m), y (m), yaw (rad).
       present: [..., R] whether the robot is present.
       hidden: [..., R, R] whether a wall or a box lies between two robots.
-      message: [..., R, M] numbers that each robot broadcast; None before the first broadcast.
-      settings: range and message size.
+      settings: range.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
       The neighbours within reach.
     """
-    if message is None:
-        message = xp.zeros((*pose.shape[:-1], settings.message_size), xp.float32)
     x, y, distance = _apart(pose, xp)
     bearing = xp.arctan2(y, x) - pose[..., :, None, 2]
     other = ~np.eye(pose.shape[-2], dtype=bool)
@@ -69,7 +62,7 @@ def reachable(
         & ~hidden
         & (distance <= settings.range)
     )
-    return Heard(xp.where(hears, distance, xp.inf), bearing, message)
+    return Heard(xp.where(hears, distance, xp.inf), bearing)
 
 
 def hidden(pose: Array, obstacle: Array, xp: Any) -> Array:
@@ -117,10 +110,10 @@ def listen(
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, K W], nearest first. The W numbers of a neighbour are a presence flag of 1, its
-      distance (m), cosine and sine of its bearing, and its message. Missing neighbours are 0.
+      [..., R, 4 K], nearest first. The numbers of a neighbour are a presence flag of 1, its
+      distance (m), and cosine and sine of its bearing. Missing neighbours are 0.
     """
-    distance, bearing, message = heard
+    distance, bearing = heard
     robots = distance.shape[-1]
     lost = _draw(realism.packet_loss, noise.uniform, seed, clock, Stream.PACKET, robots, xp)
     if lost is not None:
@@ -139,14 +132,10 @@ def listen(
     if off is not None:
         bearing = bearing + realism.neighbour_bearing_noise * off
     parts = [distance, xp.cos(bearing), xp.sin(bearing)]
-    parts += [
-        xp.broadcast_to(message[..., None, :, i], distance.shape)
-        for i in range(settings.message_size)
-    ]
     rows = [is_there, *(xp.take_along_axis(part, order, axis=-1) for part in parts)]
     found = xp.stack([xp.where(is_there, row, 0.0) for row in rows], axis=-1)
-    found = found.reshape((*found.shape[:-2], kept * settings.width))
-    lacking = (settings.count - kept) * settings.width
+    found = found.reshape((*found.shape[:-2], kept * NEIGHBOUR_SIZE))
+    lacking = (settings.count - kept) * NEIGHBOUR_SIZE
     missing = xp.zeros((*found.shape[:-1], lacking), found.dtype)
     return xp.concatenate([found, missing], axis=-1) if lacking else found
 
@@ -168,21 +157,3 @@ def _draw(
         return None
     receiver = noise.bits(seed, clock, stream, (robots,), xp)
     return draw(receiver, 0, stream, (robots,), xp)
-
-
-def broadcast(action: Array, size: int, active: Array, xp: Any) -> Array:
-    """Extracts the broadcast numbers from actions.
-
-    Args:
-      action: [..., R, 2 + M], or only the first two entries for a robot that broadcasts nothing.
-      size: M.
-      active: [..., R] whether the robot may act; a robot that may not act broadcasts 0.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      [..., R, M] within -1..1.
-    """
-    said = xp.clip(action[..., COMMAND_SIZE:], -1.0, 1.0)
-    if said.shape[-1] < size:
-        said = xp.zeros((*said.shape[:-1], size), action.dtype)
-    return xp.where(active[..., None], said, 0.0)

@@ -30,7 +30,7 @@ class Readings(NamedTuple):
       distance: [...] distance to the target, m.
       bearing: [...] bearing of the target, rad.
       own: [..., E] observations of an extension; None without any.
-      heard: [..., K W] nearest neighbours; None without neighbour messages.
+      heard: [..., K W] nearest neighbours; None if they are not observed.
     """
 
     infrared: Array
@@ -116,7 +116,7 @@ def layout(
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension, in order.
-      neighbours: neighbour settings; None without neighbour messages.
+      neighbours: neighbour settings; None if they are not observed.
 
     Returns:
       The layout.
@@ -131,7 +131,6 @@ def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float,
     """Lists name, unit, offset and scale of all neighbour entries, the nearest neighbour first."""
     one = [("", "1", 1.0), ("_distance", "m", neighbours.range)]
     one += [(f"_bearing_{part}", "1", 1.0) for part in ("cos", "sin")]
-    one += [(f"_message_{i}", "1", 1.0) for i in range(neighbours.message_size)]
     return [
         (f"neighbour_{i}{name}", unit, 0.0, scale)
         for i in range(neighbours.count)
@@ -154,11 +153,11 @@ def describe(
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension.
-      neighbours: neighbour settings; None without neighbour messages.
+      neighbours: neighbour settings; None if they are not observed.
 
     Returns:
-      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. With neighbour messages,
-      the data also holds `neighbours`: `count`, `range` (m) and `message_size`.
+      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. If neighbours
+      are observed, the data also holds `neighbours`: `count` and `range` (m).
     """
     found = {key: list(value) for key, value in layout(encoding, own, neighbours)._asdict().items()}
     heard = {} if not neighbours or not neighbours.count else {"neighbours": to_dict(neighbours)}

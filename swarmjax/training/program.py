@@ -16,11 +16,12 @@ from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
 from swarmjax.task import env, extended, surroundings
+from swarmjax.task.config import NEIGHBOUR_SIZE
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 
-ACTION_SIZE = drive.COMMAND_SIZE  # size of the action if robots broadcast nothing
+ACTION_SIZE = drive.COMMAND_SIZE
 MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
@@ -101,12 +102,12 @@ def load_ppo(config: ProgramConfig, world: World) -> PPO:
       ConfigError: the network of an extension or the gradient's backend does not fit.
     """
     size, heard = world.observation_size, config.task.neighbours
-    first = size - heard.count * heard.width
+    first = size - heard.size
     sizes = Sizes(
         observation=size,
         action=world.action_size,
         state=surroundings.SIZE if config.algo.critic == "state" else 0,
-        hearing=Hearing(first, heard.count, heard.width) if heard.count else None,
+        hearing=Hearing(first, heard.count, NEIGHBOUR_SIZE) if heard.count else None,
     )
     return PPO.make(
         config.algo,

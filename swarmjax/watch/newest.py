@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from swarmjax import command, policy_file, words
 from swarmjax.config import to_dict
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.replay import page as replay_page
 from swarmjax.replay.config import ReplayConfig
@@ -54,7 +54,7 @@ def record(settings: WatchConfig, history: History | None) -> tuple[str, str]:
         write_policy(file, leaves, trained, update, seed)
         entrant = Entrant(name, policy_file.read(file, settings.extensions))
     asked = [f"steps={trained.task.step_limit}"]
-    shown, _ = witness.load(ReplayConfig, asked, [entrant], to_dict(stage))
+    shown, _ = trained_settings.load(ReplayConfig, asked, [entrant], to_dict(stage))
     shown = replace(shown, extensions=settings.extensions)
     episodes = replay(shown, [entrant], Progress(disable=True))
     made_by = command.line("watch", f"run={run}")

@@ -19,7 +19,7 @@ def test_the_baseline_is_judged_like_any_policy(tmp_path: Path) -> None:
     settings = load_levels(EvaluateConfig, words)
     entrants = trials.read_policies([str(path)])
     (trial,) = trials.run(settings, cells.load(settings).cells, entrants)
-    assert np.mean(trial.found["targets_reached"]) == 1.0
+    assert np.mean(trial.measures["targets_reached"]) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def _by_c(folder: Path, stage: StageConfig, drives: tuple) -> dict[str, np.ndarr
         workers=1,
     )
     (trial,) = evaluate(settings).trials
-    return {name: trial.found[name][0] for name in Outcomes._fields if name != "broken"}
+    return {name: trial.measures[name][0] for name in Outcomes._fields if name != "broken"}
 
 
 def test_levels_are_those_of_the_other_judge(

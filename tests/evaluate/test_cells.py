@@ -117,15 +117,18 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda a: a.pop("meta"), "meta is missing or not JSON"),
-        (_set("meta", np.array("{")), "meta is missing or not JSON"),
-        (_meta(lambda m: m.update(format=2)), "meta.format is not 1"),
-        (_meta(lambda m: m.pop("cells")), "meta.suite or meta.cells is missing"),
-        (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names a cell more than"),
+        (lambda a: a.pop("meta"), "meta.format is not 2"),
+        (_set("meta", np.array("{")), "meta.format is not 2"),
+        (_meta(lambda m: m.update(format=1)), "meta.format is not 2"),
+        (_meta(lambda m: m.pop("cells")), "meta.cells is null: give a list"),
+        (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names one more than"),
         (_meta(lambda m: m["cells"].pop()), "some/episode is unknown: meta.cells lists no such"),
-        (_meta(lambda m: m["cells"][0].update(x=1)), "cell one: x is not a key"),
-        (_meta(lambda m: m["cells"][0]["stage"].update(robots=0)), "cell one: stage.robots is 0"),
-        (_meta(lambda m: m["cells"][0].update(seed=1)), "cell one: seed is 1: give 1000000 to"),
+        (_meta(lambda m: m["cells"][0].update(x=1)), "meta.cells one: x is not a key"),
+        (
+            _meta(lambda m: m["cells"][0]["stage"].update(robots=0)),
+            "meta.cells one: stage.robots is",
+        ),
+        (_meta(lambda m: m["cells"][0].update(seed=1)), "meta.cells one: seed is 1: give"),
         (_meta(lambda m: m["cells"][0].update(digest=None)), "cell one: digest is missing."),
         (_meta(lambda m: m["cells"][0].update(digest="0" * 64)), "cell one of the file has the "),
         (_set("one/other", np.zeros(3)), "one/other is unknown"),
@@ -141,7 +144,6 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
         (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
         (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
-        (_set("two/obstacle", np.array([None])), "it cannot be read: 'two/obstacle.npy' is not"),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(
@@ -156,25 +158,10 @@ def test_a_file_that_is_unsound_is_refused(
     assert refusal(cells.read, path).startswith(f"suite {path}: {reason}")
 
 
-def test_a_file_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_is_compressed_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "levels.npz"
     np.savez_compressed(path, zeros=np.zeros(10_000))
-    monkeypatch.setattr(cells, "MAX_BYTES", 10_000)
-    assert path.stat().st_size < 10_000 < 8 * 10_000
-    assert "it unpacks to more than 10000 bytes" in refusal(cells.read, path)
-
-
-def test_a_file_that_is_too_large_is_not_read(
-    tmp_path: Path, tiny: Suite, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "levels.npz"
-    cells.write(path, tiny)
-    size = path.stat().st_size
-    monkeypatch.setattr(cells, "MAX_BYTES", size - 1)
-    sentence = refusal(cells.read, path)
-    assert sentence == f"suite {path} cannot be read: it has more than {size - 1} bytes."
+    assert "it unpacks to more than the file" in refusal(cells.read, path)
 
 
 @settings(max_examples=150)

@@ -65,27 +65,29 @@ def test_the_engines_of_the_command_agree(
         assert by_mjx.result["cells"][0][key] == by_c.result["cells"][0][key]
     (c,), (mjx,) = by_c.trials, by_mjx.trials
     np.testing.assert_array_equal(c.shortest, mjx.shortest)
-    missing = set(c.found) - set(mjx.found)
-    assert missing == {name for name in c.found if name.startswith("impulse")}
-    free = c.found["contacts_per_robot"][0] == 0.0
+    missing = set(c.measures) - set(mjx.measures)
+    assert missing == {name for name in c.measures if name.startswith("impulse")}
+    free = c.measures["contacts_per_robot"][0] == 0.0
     assert 2 < free.sum() < count
     # Sampling changes the path efficiency by more than twice the tolerance below.
     (mean,) = still.trials
-    assert np.abs(mean.found["spl"] - c.found["spl"])[0, free].max() > 4e-3
-    for name, found in mjx.found.items():
+    assert np.abs(mean.measures["spl"] - c.measures["spl"])[0, free].max() > 4e-3
+    for name, found in mjx.measures.items():
         # Without contact, paths differ by rounding, which may shift a count by one step. Path
         # lengths are sums of 120 float32 strides.
         step = 1.01 / STEPS if name == "ir_steps_share" else 1.01 * CONTROL_STEP
-        np.testing.assert_allclose(found[0, free], c.found[name][0, free], atol=step, err_msg=name)
+        np.testing.assert_allclose(
+            found[0, free], c.measures[name][0, free], atol=step, err_msg=name
+        )
         # With contacts, at most one robot of one level ends differently, since the solvers stop at
         # different errors. If it meets another robot once more, each of the two counts a contact.
         twice = name in ("contacts_per_robot", "contacts_robot")
         ends = (2.01 if twice else 1.01) / (count * STAGES[1].robots)
         most = 3 * CONTROL_STEP if MEASURES[name].unit == "s" else ends
-        np.testing.assert_allclose(found.mean(), c.found[name].mean(), atol=most, err_msg=name)
-    np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
+        np.testing.assert_allclose(found.mean(), c.measures[name].mean(), atol=most, err_msg=name)
+    np.testing.assert_allclose(mjx.measures["spl"][0, free], c.measures["spl"][0, free], atol=2e-3)
     for name in ("targets_reached", "all_reached", "contacts_per_robot"):
-        np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free])
+        np.testing.assert_array_equal(mjx.measures[name][0, free], c.measures[name][0, free])
 
 
 @pytest.mark.slow
@@ -97,15 +99,15 @@ def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
     said = policies.meta(activation="relu", **told)
     policy_file.write(path, given | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     c, mjx = (_judge(path, STAGES[0], engine, episodes=8).trials[0] for engine in ("c", "mjx"))
-    free = c.found["contacts_per_robot"][0] == 0.0
+    free = c.measures["contacts_per_robot"][0] == 0.0
     assert free.sum() > 2
-    np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
+    np.testing.assert_allclose(mjx.measures["spl"][0, free], c.measures["spl"][0, free], atol=2e-3)
     # Without its memory the policy drives another path: the difference is three times the
     # tolerance between the engines.
     other = tmp_path / "other.npz"
     policy_file.write(other, none | {"actor/log_std": np.full((1, 2), -3.0, np.float32)}, said)
     forgetful = _judge(other, STAGES[0], "c", episodes=8).trials[0]
-    assert np.abs(forgetful.found["spl"] - c.found["spl"])[0, free].max() > 6e-3
+    assert np.abs(forgetful.measures["spl"] - c.measures["spl"])[0, free].max() > 6e-3
 
 
 def test_boxes_beyond_what_the_engine_is_compiled_for_are_refused() -> None:

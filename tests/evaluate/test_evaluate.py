@@ -61,10 +61,10 @@ def test_a_result_does_not_depend_on_batches_and_workers(
         found.append(trial)
     for other in found[1:]:
         np.testing.assert_array_equal(other.shortest, found[0].shortest)
-        for name, table in other.found.items():
-            np.testing.assert_array_equal(table, found[0].found[name], err_msg=name)
-    assert found[0].found["targets_reached"].mean() > 0.0
-    assert list(found[0].found) == list(MEASURES)
+        for name, table in other.measures.items():
+            np.testing.assert_array_equal(table, found[0].measures[name], err_msg=name)
+    assert found[0].measures["targets_reached"].mean() > 0.0
+    assert list(found[0].measures) == list(MEASURES)
 
 
 @pytest.mark.parametrize("side", [0.5, 0.7])
@@ -174,7 +174,7 @@ def test_cells_that_share_levels_are_not_pooled(
         assert one is two is None
         return
     assert one["episodes"] == two["episodes"] == 30
-    mean = np.mean([trial.found["spl"] for trial in trials])
+    mean = np.mean([trial.measures["spl"] for trial in trials])
     assert one["measures"]["spl"]["mean"] == pytest.approx(mean)
     assert two["measures"]["spl"]["a"] == pytest.approx(mean)
 

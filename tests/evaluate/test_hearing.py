@@ -17,7 +17,7 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate import engine_c, engine_mjx, rays
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.evaluate.witness import load as witness_load
+from swarmjax.evaluate.trained_settings import load as load_as_trained
 from swarmjax.policy import Policy
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
@@ -27,7 +27,7 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import env, hearing
 from swarmjax.task.stage_config import StageConfig
 
-WORDS = ["stage=s3", "task.neighbours.count=2", "task.neighbours.message_size=2"]
+WORDS = ["stage=s3", "task.neighbours.count=2"]
 STAGE = StageConfig(name="boxes", robots=4, side=1.4, obstacles=4, obstacle_size=0.2)
 
 
@@ -38,7 +38,7 @@ def _policy(path: Path, words: list[str] = WORDS, kind: str = "none") -> str:
     heard = config.task.neighbours
     arrays = policies.arrays()
     if heard.count:
-        arrays, _ = policies.hearing(arrays, heard.count, heard.message_size)
+        arrays, _ = policies.hearing(arrays, heard.count)
     if kind == "gru":
         arrays, meta = policies.recalling(arrays, 5, **meta)
     policies.saved(path, arrays, **meta)
@@ -84,9 +84,9 @@ def test_both_engines_observe_the_same_neighbours_step_by_step(kind: str, tmp_pa
     for _ in range(20):
         mine = np.asarray(state.observation)[: STAGE.robots, 10:]
         np.testing.assert_allclose(mine, arenas.observation[0, :, 10:], atol=1e-4)
-        heard += (mine[:, ::6] > 0).sum()
-        action = draw.uniform(-1.2, 1.2, (1, STAGE.robots, 4)).astype(np.float32)
-        padded = np.zeros((len(level.present), 4), np.float32)
+        heard += (mine[:, ::4] > 0).sum()
+        action = draw.uniform(-1.2, 1.2, (1, STAGE.robots, 2)).astype(np.float32)
+        padded = np.zeros((len(level.present), 2), np.float32)
         padded[: STAGE.robots] = action[0]
         state, _ = step(state, jnp.asarray(padded))
         arenas = engine_c.step(judge, arenas, action)
@@ -114,18 +114,18 @@ def _with(judge: evaluate_judge.Judge, trained: Policy) -> evaluate_judge.Judge:
 
 def test_a_policy_is_judged_with_the_hearing_that_it_has(tmp_path: Path) -> None:
     path = _policy(tmp_path / "hears.npz")
-    settings, _ = witness_load(EvaluateConfig, [f"policy={path}"])
-    assert (settings.task.neighbours.count, settings.task.neighbours.message_size) == (2, 2)
+    settings, _ = load_as_trained(EvaluateConfig, [f"policy={path}"])
+    assert settings.task.neighbours.count == 2
 
 
 @pytest.mark.parametrize(
     ("key", "value", "held"),
-    [("count", 3, 2), ("message_size", 1, 2), ("range", 0.5, 0.7)],
+    [("count", 3, 2), ("range", 0.5, 0.7)],
 )
 def test_another_hearing_is_refused(key: str, value: float, held: float, tmp_path: Path) -> None:
     path = _policy(tmp_path / "hears.npz")
     sentence = refusal(
-        lambda *words: witness_load(EvaluateConfig, words),
+        lambda *words: load_as_trained(EvaluateConfig, words),
         f"policy={path}",
         f"task.neighbours.{key}={value}",
     )
@@ -139,10 +139,10 @@ def test_another_hearing_is_refused(key: str, value: float, held: float, tmp_pat
 def test_a_policy_that_does_not_hear_is_not_made_to(tmp_path: Path) -> None:
     path = _policy(tmp_path / "deaf.npz", ["stage=s3"])
     with pytest.raises(ConfigError, match=r"task\.neighbours\.count is 2, but .* trained with 0"):
-        witness_load(EvaluateConfig, [f"policy={path}", "task.neighbours.count=2"])
+        load_as_trained(EvaluateConfig, [f"policy={path}", "task.neighbours.count=2"])
 
 
 def test_policies_that_hear_and_do_not_are_compared_each_with_its_own(tmp_path: Path) -> None:
     first, second = _policy(tmp_path / "a.npz"), _policy(tmp_path / "b.npz", ["stage=s3"])
-    settings, _ = witness_load(EvaluateConfig, [f"compare={first},{second}"])
+    settings, _ = load_as_trained(EvaluateConfig, [f"compare={first},{second}"])
     assert settings.task.neighbours.count == 2

@@ -133,16 +133,16 @@ def test_the_judges_agree_on_the_same_levels(tmp_path: Path) -> None:
     # A robot turns to its target, drives slowly and never stops, so it passes through the target.
     path = steering.write(tmp_path / "policy.npz", ((0.2, 0.0), (-2.0, 2.0), (-2.0, -2.0)))
     (c,), (mjx,) = (_judged(path, engine).trials for engine in ("c", "mjx"))
-    free = c.found["contacts_per_robot"][0] == 0.0
+    free = c.measures["contacts_per_robot"][0] == 0.0
     assert 5 < free.sum() < EPISODES
-    assert 0.0 < c.found["all_reached"].mean() < 1.0
+    assert 0.0 < c.measures["all_reached"].mean() < 1.0
     for name in ("targets_reached", "all_reached", "contacts_per_robot", "deadlocks", "time_outs"):
-        np.testing.assert_array_equal(mjx.found[name][0, free], c.found[name][0, free], name)
+        np.testing.assert_array_equal(mjx.measures[name][0, free], c.measures[name][0, free], name)
     for name in ("time_to_reach_s", "episode_time_s"):
         # Without contacts, paths differ by rounding, which may shift an arrival by one step.
-        found, expected = mjx.found[name][0, free], c.found[name][0, free]
+        found, expected = mjx.measures[name][0, free], c.measures[name][0, free]
         np.testing.assert_allclose(found, expected, atol=1.01 * SECOND, err_msg=name)
-    np.testing.assert_allclose(mjx.found["spl"][0, free], c.found["spl"][0, free], atol=2e-3)
+    np.testing.assert_allclose(mjx.measures["spl"][0, free], c.measures["spl"][0, free], atol=2e-3)
 
 
 def test_the_rule_changes_what_is_judged_and_not_the_levels(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_the_rule_changes_what_is_judged_and_not_the_levels(tmp_path: Path) -> N
     latch, hold = (_judged(path, "c", task=TaskConfig(arrival=rule)) for rule in ("latch", "hold"))
     digests = [each.result["cells"][0]["digest"] for each in (latch, hold)]
     assert digests[0] == digests[1]
-    reached = [each.trials[0].found["targets_reached"].sum() for each in (latch, hold)]
+    reached = [each.trials[0].measures["targets_reached"].sum() for each in (latch, hold)]
     assert reached[0] > reached[1] == 0.0
     assert hold.result["task"]["arrival"] == "hold"
 

@@ -21,7 +21,7 @@ from swarmjax.policy import Policy
 from swarmjax.ppo import networks, normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Hearing, Sizes
-from swarmjax.task.config import NeighboursConfig
+from swarmjax.task.config import NEIGHBOUR_SIZE, NeighboursConfig
 
 OBSERVATIONS = 10_000
 # The required agreement. Sums of 64 float32 terms differ only in their order. This changes actions
@@ -198,15 +198,15 @@ def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
     assert np.abs(expected - _by_numpy_steps(trained, seen, begins | True)).max() > 0.1
 
 
-HEARD, SAID = 3, 2
+HEARD = 3
 
 
 def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.ndarray) -> np.ndarray:
     """Returns actions [T, R, U] of the Flax networks that hear, with or without a memory."""
     memory = {"memory": "gru", "memory_size": MEMORY} if kind == "gru" else {}
-    size, heard = seen.shape[-1], NeighboursConfig(count=HEARD, message_size=SAID)
-    place = Hearing(size - heard.count * heard.width, heard.count, heard.width)
-    sizes = Sizes(size, 2 + SAID, hearing=place)
+    size, heard = seen.shape[-1], NeighboursConfig(count=HEARD)
+    place = Hearing(size - heard.size, heard.count, NEIGHBOUR_SIZE)
+    sizes = Sizes(size, 2, hearing=place)
     nets = networks.make(AlgoConfig(**memory), sizes)
 
     def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
@@ -236,7 +236,7 @@ def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.nda
 @pytest.mark.parametrize("kind", ["none", "gru"])
 def test_all_forms_of_a_policy_that_hears_agree(kind: str, learners: int, tmp_path: Path) -> None:
     plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
-    arrays, said = policies.hearing(plain, HEARD, SAID, **several(learners))
+    arrays, said = policies.hearing(plain, HEARD, **several(learners))
     if kind == "gru":
         arrays, said = policies.recalling(arrays, MEMORY, **said)
     trained = saved(tmp_path / "policy.npz", arrays, **said)
@@ -251,6 +251,6 @@ def test_all_forms_of_a_policy_that_hears_agree(kind: str, learners: int, tmp_pa
         if remembers
         else _by_c(trained, seen, tmp_path / "c"),
     }
-    assert expected.shape == (STEPS, learners, 2 + SAID)
+    assert expected.shape == (STEPS, learners, 2)
     for name, action in found.items():
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)

@@ -1,10 +1,9 @@
 """Checks networks that hear neighbours.
 
-The order of neighbours does not matter, absent neighbours do not count, and a message is learned.
+The order of neighbours does not matter, and absent neighbours do not count.
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -126,106 +125,3 @@ def test_the_kernels_are_not_taken_for_robots_that_hear(monkeypatch: pytest.Monk
     for sizes, backend in ((plain, "fused"), (heard, "autodiff")):
         nets = networks.make(AlgoConfig(), sizes)
         assert dispatch.resolve(AlgoConfig(), nets, sizes) == backend
-
-
-# A probe with pairs of robots. Each robot sees a number, -1 or 1, and its partner is rewarded for
-# acting on that number. The partner needs the message that the robot sent one control step before.
-# Only the reward that both share teaches the robot to send it.
-PAIRS, UPDATES, STEPS = 64, 150, 4
-PROBE = AlgoConfig(
-    hidden_sizes=(16, 16),
-    rollout_length=STEPS * 4,
-    epochs=4,
-    num_minibatches=4,
-    discount=0.5,
-    actor_learning_rate=5e-3,
-    critic_learning_rate=5e-3,
-)
-ROW = 5  # presence, distance, cosine, sine, message
-
-
-def _look(draw: jax.Array, said: jax.Array) -> jax.Array:
-    """Returns what both robots [B, 2] see: their own number, and a row with the other's message."""
-    one = jnp.ones_like(draw)
-    row = [one, 0.5 * one, one, 0.0 * one, said[:, ::-1]]
-    return jnp.stack([draw, *row], axis=-1)
-
-
-def _live(ppo: PPO, deaf: bool, state: LearnerState, carry: Any, key: jax.Array) -> tuple[Any, Any]:
-    """Runs one control step of all pairs; the numbers stay fixed in an episode of STEPS steps."""
-    draw, said, clock = carry
-    noise, fresh = jax.random.split(key)
-    seen = _look(draw, said)
-    action, log_prob, _ = ppo.act(state, seen, jax.random.normal(noise, (PAIRS, 2, 2)))
-    heard = jnp.where(deaf, 0.0, jnp.clip(action[..., 1], -1.0, 1.0))
-    # The first step of an episode gives no reward, since no message has been sent yet.
-    paid = -jnp.abs(action[..., 0] - draw[:, ::-1]) * (clock > 0)
-    ends = clock + 1 == STEPS
-    drawn = jax.random.rademacher(fresh, draw.shape, jnp.float32)
-    after = (
-        jnp.where(ends, drawn, draw),
-        jnp.where(ends, 0.0, heard),
-        jnp.where(ends, 0, clock + 1),
-    )
-    value, _ = ppo.value(state, seen)
-    # A message earns a reward only within its episode, which ends with `ends` for both robots.
-    return after, (seen, action, log_prob, paid, value, jnp.broadcast_to(ends, paid.shape))
-
-
-def _shared(paid: jax.Array) -> jax.Array:
-    """Returns the summed reward of both robots, [T, B, 2], which also rewards a good message."""
-    return paid + paid[..., ::-1]
-
-
-def _iterate(ppo: PPO, deaf: bool, carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-    from swarmjax.ppo.batch import generalized_advantages
-
-    (state, world), config = carry, ppo.config
-    roll, learn = jax.random.split(key)
-    keys = jax.random.split(roll, config.rollout_length)
-    live = functools.partial(_live, ppo, deaf, state)
-    world, (seen, action, log_prob, paid, value, ends) = jax.lax.scan(live, world, keys)
-    following = jnp.concatenate([value[1:], value[-1:]])
-    none = jnp.zeros_like(ends)
-    advantage, return_ = generalized_advantages(
-        _shared(paid), value, following, ends, none, discount=config.discount, gae_lambda=0.95
-    )
-
-    def group(x: jax.Array) -> jax.Array:
-        x = jnp.moveaxis(x, 0, 1)
-        return x.reshape(PAIRS, -1, *x.shape[3:])
-
-    batch = Batch(
-        observation=group(seen),
-        action=group(action),
-        log_prob=group(log_prob),
-        advantage=group(advantage),
-        return_=group(return_),
-        valid=jnp.ones((PAIRS, config.rollout_length * 2), bool),
-    )
-    state, _ = ppo.update(state, batch, learn)
-    return (state, world), paid.sum() / (paid != 0).sum()
-
-
-def _earned(deaf: bool) -> float:
-    """Returns the mean reward per step at the end of training: 0 at best, -1 by chance."""
-    sizes = Sizes(1 + ROW, 2, hearing=Hearing(1, 1, ROW))
-    ppo = learners.ppo(PROBE, sizes, UPDATES, "autodiff")
-    state = ppo.init(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), UPDATES)
-    draw = jax.random.rademacher(jax.random.key(2), (PAIRS, 2), jnp.float32)
-    world = (draw, jnp.zeros((PAIRS, 2)), jnp.zeros((), jnp.int32))
-    _, earned = jax.jit(
-        lambda state, world: jax.lax.scan(
-            functools.partial(_iterate, ppo, deaf), (state, world), keys
-        )
-    )(state, world)
-    return float(earned[-10:].mean())
-
-
-@pytest.mark.slow
-def test_a_task_that_only_a_message_solves_is_learned_with_messages_alone() -> None:
-    # A robot that hears nothing does best with any constant action within -1..1: its mean reward
-    # is -1, less the cost of exploration. A robot that hears loses only the cost of exploration.
-    assert _earned(deaf=True) < -0.95
-    assert _earned(deaf=False) > -0.5

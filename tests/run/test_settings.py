@@ -236,8 +236,6 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[s1,grid]"], "stage.sequence is grid, which names several stages: "
          "give single stages."),
         # Checks across keys.
-        (["task.neighbours.message_size=2"], "task.neighbours.message_size is 2, but count is "
-         "0, so no robot receives messages: give a count of 1 or more, or message_size=0."),
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
         (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
          "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),

@@ -1,10 +1,7 @@
-"""Tests which robots hear each other, how an observation holds it, and messages in an arena."""
+"""Tests which robots hear each other, and how an observation holds it."""
 
-import dataclasses
-import functools
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,18 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarmjax.config import ConfigError
-from swarmjax.sim.config import SimConfig
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import env, hearing, observation
-from swarmjax.task.config import NeighboursConfig, TaskConfig
-from swarmjax.task.level import Level
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task import hearing, observation
+from swarmjax.task.config import NeighboursConfig
 
 XPS = [np, pytest.param(jnp, marks=pytest.mark.slow)]
 NOBODY = np.array([[9.0, 9.0, 0.0, 0.1, 0.1]], np.float32)
 # Robot 0 is in the middle and faces north. The others are 0.3 m north, 0.4 m east and 0.8 m west.
 POSE = np.array([[0, 0, np.pi / 2], [0, 0.3, 0], [0.4, 0, 0], [-0.8, 0, 0]], np.float32)
-SAID = np.array([[0.1], [0.2], [0.3], [0.4]], np.float32)
 PRESENT = np.ones(4, bool)
 
 
@@ -33,15 +26,14 @@ def _listen(
     obstacle: np.ndarray = NOBODY,
     present: np.ndarray = PRESENT,
     count: int = 2,
-    said: np.ndarray = SAID,
     seed: int | None = None,
     **realism: Any,
 ) -> np.ndarray:
     """Returns what each robot hears within 0.7 m, [R, K, W]."""
-    config = NeighboursConfig(count=count, message_size=said.shape[-1])
+    config = NeighboursConfig(count=count)
     obstacle, pose = xp.asarray(obstacle, xp.float32), xp.asarray(pose)
     hidden = hearing.hidden(pose, obstacle, xp)
-    heard = hearing.reachable(pose, xp.asarray(present), hidden, xp.asarray(said), config, xp)
+    heard = hearing.reachable(pose, xp.asarray(present), hidden, config, xp)
     drawn = None if seed is None else xp.asarray(seed, xp.uint32)
     found = hearing.listen(heard, config, RealismConfig(**realism), drawn, xp.asarray(3), xp)
     return np.asarray(found).reshape(len(pose), count, -1)
@@ -50,7 +42,7 @@ def _listen(
 @pytest.mark.parametrize("xp", XPS)
 def test_neighbours_are_nearest_first_in_the_frame_of_the_one_that_hears(xp: Any) -> None:
     # The robot in the north is straight ahead; the robot in the east is at -90 degrees.
-    expected = [[1.0, 0.3, 1.0, 0.0, 0.2], [1.0, 0.4, 0.0, -1.0, 0.3]]
+    expected = [[1.0, 0.3, 1.0, 0.0], [1.0, 0.4, 0.0, -1.0]]
     np.testing.assert_allclose(_listen(xp)[0], expected, atol=1e-6)  # a sine in float32
 
 
@@ -89,7 +81,7 @@ def test_more_neighbours_than_robots_are_rows_of_zeros() -> None:
 def test_packets_are_lost_as_often_as_said(xp: Any) -> None:
     pose = np.zeros((40, 3), np.float32)
     pose[:, 0] = 0.01 * np.arange(40)
-    whom = {"pose": pose, "present": np.ones(40, bool), "said": np.zeros((40, 0), np.float32)}
+    whom = {"pose": pose, "present": np.ones(40, bool)}
     found = _listen(xp, count=32, seed=1, packet_loss=0.75, **whom)
     heard = found[..., 0].sum() / (40 * 39)
     assert abs(heard - 0.25) < 0.044  # 4 standard errors, from 1,560 packets
@@ -102,7 +94,7 @@ def test_a_lost_packet_leaves_no_trace() -> None:
 def test_noise_of_a_pair_does_not_depend_on_how_many_robots_there_are() -> None:
     noisy = {"seed": 5, "neighbour_distance_noise": 0.02, "neighbour_bearing_noise": 0.1}
     whole = _listen(np, **noisy)
-    fewer = _listen(np, pose=POSE[:3], present=PRESENT[:3], said=SAID[:3], **noisy)
+    fewer = _listen(np, pose=POSE[:3], present=PRESENT[:3], **noisy)
     np.testing.assert_array_equal(fewer, whole[:3])
     assert not np.allclose(whole[0], _listen(np)[0])
 
@@ -114,25 +106,23 @@ def test_numpy_and_jax_hear_the_same(seed: int, count: int) -> None:
     pose = draw.uniform(-0.6, 0.6, (5, 3)).astype(np.float32)
     boxes = np.concatenate([draw.uniform(-0.6, 0.6, (3, 3)), draw.uniform(0.01, 0.1, (3, 2))], 1)
     whom: dict[str, Any] = {"pose": pose, "obstacle": boxes.astype(np.float32), "count": count}
-    whom |= {"present": draw.random(5) < 0.8, "said": draw.uniform(-1, 1, (5, 2))}
-    whom["said"] = whom["said"].astype(np.float32)
+    whom |= {"present": draw.random(5) < 0.8}
     found = [_listen(xp, seed=seed % 2**31, packet_loss=0.3, **whom) for xp in (np, jnp)]
     np.testing.assert_allclose(found[0], found[1], atol=2e-6)  # sine and square root in float32
 
 
 def test_the_layout_names_what_is_heard() -> None:
-    config = NeighboursConfig(count=2, range=0.5, message_size=1)
+    config = NeighboursConfig(count=2, range=0.5)
     found = observation.layout("metric", (), config)
-    assert found.names[10:15] == (
+    assert found.names[10:14] == (
         "neighbour_0",
         "neighbour_0_distance",
         "neighbour_0_bearing_cos",
         "neighbour_0_bearing_sin",
-        "neighbour_0_message_0",
     )
-    assert found.units[10:15] == ("1", "m", "1", "1", "1")
-    assert found.scale[10:15] == (1.0, 0.5, 1.0, 1.0, 1.0)
-    assert found.size == 10 + 2 * 5
+    assert found.units[10:14] == ("1", "m", "1", "1")
+    assert found.scale[10:14] == (1.0, 0.5, 1.0, 1.0)
+    assert found.size == 10 + 2 * 4
 
 
 def test_robots_that_do_not_hear_observe_as_before() -> None:
@@ -142,7 +132,6 @@ def test_robots_that_do_not_hear_observe_as_before() -> None:
 @pytest.mark.parametrize(
     ("section", "said", "sentence"),
     [
-        (NeighboursConfig, {"message_size": 2}, "message_size is 2, but count is 0"),
         (NeighboursConfig, {"count": 1, "range": 0.0}, "range is 0"),
         (NeighboursConfig, {"count": 1, "range": 11.0}, "range is 11"),
         (NeighboursConfig, {"count": 33}, "count is 33"),
@@ -152,57 +141,3 @@ def test_robots_that_do_not_hear_observe_as_before() -> None:
 def test_what_cannot_be_heard_is_refused(section: Any, said: Any, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         section(**said)
-
-
-@pytest.fixture(scope="module")
-def world() -> env.World:
-    stage = StageConfig(name="two", robots=3, side=1.0, obstacles=1)
-    task = TaskConfig(neighbours=NeighboursConfig(count=2, message_size=2), step_limit=50)
-    return env.load([stage], task=task, sim=SimConfig(max_robots=3, max_obstacles=1, impl="jax"))
-
-
-@pytest.fixture(scope="module")
-def level() -> Level:
-    """Returns a level whose first robot arrives after driving one step; its third is absent."""
-    return Level(
-        side=np.float32(1.0),
-        present=np.array([True, True, False]),
-        start=np.array([[0, 0, 0], [0.3, 0, np.pi], [6, 6, 0]], np.float32),
-        target=np.array([[0.05, 0], [-0.3, 0.3], [6, 6]], np.float32),
-        obstacle_present=np.array([False]),
-        obstacle=np.array([[-5.5, -5.0, 0.0, 0.05, 0.05]], np.float32),
-        seed=np.uint32(0),
-    )
-
-
-def _play(world: env.World, level: Level, action: np.ndarray, steps: int) -> list[np.ndarray]:
-    """Returns the messages [R, K, M] heard at the start and after each step."""
-    from swarmjax.sim import physics
-
-    state = env.reset(world, jax.tree.map(jnp.asarray, level))
-    state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
-    seen, step = [state.observation], jax.jit(functools.partial(env.step, world))
-    for _ in range(steps):
-        state, _ = step(state, jnp.asarray(action))
-        seen.append(state.observation)
-    return [np.asarray(x)[:, 10:].reshape(3, 2, 6)[..., 4:] for x in seen]
-
-
-def test_messages_are_heard_in_the_next_control_step(world: env.World, level: Level) -> None:
-    action = np.array([[-1, 0, 0.25, -3.0], [-1, 0, 0.5, 0.75], [1, 1, 1, 1]], np.float32)
-    first, second = _play(world, level, action, 1)
-    assert not first.any()  # no robot has sent a message yet
-    np.testing.assert_array_equal(second[:2, 0], [[0.5, 0.75], [0.25, -1.0]])
-    assert not second[:2, 1].any()  # the third is absent
-
-
-def test_a_robot_that_has_arrived_is_near_but_silent(world: env.World, level: Level) -> None:
-    action = np.array([[1, 0, 0.25, 0.5], [-1, 0, 0.5, 0.75], [1, 1, 1, 1]], np.float32)
-    _, arriving, arrived = _play(world, level, action, 2)
-    np.testing.assert_array_equal(arriving[1, 0], [0.25, 0.5])
-    np.testing.assert_array_equal(arrived[1, 0], [0.0, 0.0])
-
-
-def test_an_action_without_its_message_is_refused(world: env.World, level: Level) -> None:
-    with pytest.raises(AssertionError):
-        _play(world, level, np.zeros((3, 2), np.float32), 1)

@@ -18,7 +18,6 @@ WORDS = [
     "algo.hidden_sizes=[8]",
     "task.step_limit=12",
     "task.neighbours.count=2",
-    "task.neighbours.message_size=1",
     "run.tensorboard=false",
 ]
 KINDS = {
@@ -46,7 +45,7 @@ def test_a_resumed_run_is_bit_for_bit_that_of_one_go(kind: str, tmp_path: Path) 
     assert digest(checkpoint.find(whole)[0]) == digest(checkpoint.find(parts)[0])
     trained = policy_file.read(whole / "policy.npz")
     assert trained.meta["format"] == policy.FORMAT
-    assert trained.neighbours == {"count": 2, "range": 0.7, "message_size": 1}
+    assert trained.neighbours == {"count": 2, "range": 0.7}
     np.testing.assert_array_equal(trained.mean[0, 10:], 0.0)
     np.testing.assert_array_equal(trained.std[0, 10:], 1.0)
     assert policy.load(whole / "policy.npz").digest == trained.digest

@@ -72,7 +72,7 @@ void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACT
 {
     command[0] = (clip(action[0], 1.0f) + 1.0f) * (0.5f * $max_speed);
     command[1] = clip(action[1], 1.0f) * $max_turn_rate;
-${said}}
+}
 
 void policy_wheel_speeds(const float command[POLICY_ACTIONS], float wheels[2])
 {

@@ -8,7 +8,7 @@ import pytest
 from sentences import refusal
 
 from swarmjax.config import build, files
-from swarmjax.evaluate import witness
+from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
@@ -25,7 +25,7 @@ def _policy(path: Path, *words: str) -> str:
 
 
 def _load(*words: str) -> EvaluateConfig:
-    return witness.load(EvaluateConfig, words)[0]
+    return trained_settings.load(EvaluateConfig, words)[0]
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_hull_sensors_task_realism_and_stage_are_those_of_training(odd: str) -> 
 
 def test_the_rule_of_arrival_is_that_of_training(tmp_path: Path) -> None:
     word = _policy(tmp_path / "hold.npz", "task.arrival=hold")
-    settings, said = witness.load(EvaluateConfig, [word])
+    settings, said = trained_settings.load(EvaluateConfig, [word])
     assert settings.task.arrival == "hold"
     assert "arrival hold" in said
     assert _load(word, "task.arrival=latch").task.arrival == "latch"
@@ -100,7 +100,7 @@ def test_a_cell_of_a_grid_is_judged_without_a_file(tmp_path: Path) -> None:
 
 
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
-    said = witness.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
+    said = trained_settings.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
     assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")
     assert said.endswith(
         "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3"
@@ -111,7 +111,7 @@ def test_the_first_line_does_not_take_a_file_of_realism_for_a_preset(tmp_path: P
     file = tmp_path / "noisy.yaml"
     file.write_text("infrared: real\nmass: [0.1, 0.2]\n")
     word = _policy(tmp_path / "p.npz", f"realism={file}")
-    settings, said = witness.load(EvaluateConfig, [word])
+    settings, said = trained_settings.load(EvaluateConfig, [word])
     assert settings.realism.mass == (0.1, 0.2)
     assert "realism custom" in said
 
@@ -130,7 +130,7 @@ def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> N
 def test_a_file_of_an_older_version_names_the_last_commit_that_reads_it() -> None:
     meta = policies.meta()
     meta["realism"]["dropout"] = 0.1
-    assert refusal(witness.trained, meta, "p.npz") == (
+    assert refusal(trained_settings.trained, meta, "p.npz") == (
         "p.npz: meta.realism.dropout is not a key: if an older version wrote it, d8b3078 is the "
         "last commit that reads it."
     )
@@ -139,5 +139,5 @@ def test_a_file_of_an_older_version_names_the_last_commit_that_reads_it() -> Non
 def test_a_file_without_a_config_says_what_its_own_keys_hold() -> None:
     meta = policies.meta(config={})
     meta["robot"] = {**meta["robot"], "track": 0.05}
-    found = witness.trained(meta, "p.npz")
+    found = trained_settings.trained(meta, "p.npz")
     assert (found.robot.track, found.robot.hull_radius, found.stages) == (0.05, 0.037, [])

@@ -23,9 +23,9 @@ from swarmjax.task.config import TaskConfig, describe
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
-_TOLD = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
+_SHOWN = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 # Each policy has its own values of these keys, because they determine its network's inputs.
-_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range", "message_size"))
+_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range"))
 
 
 class Trained(NamedTuple):
@@ -98,13 +98,13 @@ def load[C: Section](
     else:
         metas = {each.path: each.policy.meta for each in entrants}
         typed = [f"policy={','.join(metas)}", *typed]
-    found = [trained(meta, path) for path, meta in metas.items()]
-    words = [_words(cls, each, typed) for each in found]
+    trainings = [trained(meta, path) for path, meta in metas.items()]
+    words = [_words(cls, each, typed) for each in trainings]
     _check_alike(cls, list(metas), words, typed)
-    if stage is None and found and found[0].stages:
-        stage = found[0].stages[-1]
+    if stage is None and trainings and trainings[0].stages:
+        stage = trainings[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
-    _check_own(settings, dict(zip(metas, found, strict=True)))
+    _check_own(settings, dict(zip(metas, trainings, strict=True)))
     return settings, _say(settings, typed)
 
 
@@ -113,11 +113,11 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
     given = files.parse(cls, typed)
     policy, compare = (given.get(key) or "" for key in ("policy", "compare"))
     sides = [("policy", policy), *(("compare", part) for part in str(compare).split(","))]
-    found = [path for key, text in sides if text for path in list_files(key, str(text))]
-    return list(dict.fromkeys(found))
+    paths = [path for key, text in sides if text for path in list_files(key, str(text))]
+    return list(dict.fromkeys(paths))
 
 
-def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str]:
+def _words(cls: type[Section], training: Trained, typed: Sequence[str]) -> list[str]:
     """Converts the training's settings to arguments.
 
     The judge's body keeps its wheels if a robot file names no body.
@@ -126,9 +126,9 @@ def _words(cls: type[Section], found: Trained, typed: Sequence[str]) -> list[str
     own = {"body": BODY} if choice is None else files.read_choice("robot", choice)
     return [
         *([] if "body" in own.get("robot", own) else [f"robot.body={BODY}"]),
-        *inherit.group_words(cls, "robot", found.robot, typed, skip=["body"]),
-        *inherit.group_words(cls, "task", found.task, typed),
-        *inherit.preset_words(cls, "realism", found.realism, typed),
+        *inherit.group_words(cls, "robot", training.robot, typed, skip=["body"]),
+        *inherit.group_words(cls, "task", training.task, typed),
+        *inherit.preset_words(cls, "realism", training.realism, typed),
     ]
 
 
@@ -136,11 +136,11 @@ def _check_alike(
     cls: type[Section], paths: list[str], words: list[list[str]], typed: Sequence[str]
 ) -> None:
     """Refuses policies that were trained differently, unless an argument decides."""
-    told = files.parse(cls, typed)
+    given = files.parse(cls, typed)
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]
-            if key not in told and key not in _OWN:
+            if key not in given and key not in _OWN:
                 first, other = (_value(each, key) for each in (words[0], mine))
                 raise ConfigError(
                     f"{paths[0]} and {path} were trained differently, with {key} {first} and "
@@ -148,12 +148,12 @@ def _check_alike(
                 )
 
 
-def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
+def _check_own(settings: Any, trainings: Mapping[str, Trained]) -> None:
     """Refuses settings with another hearing than the first policy's.
 
     Each policy is judged with its own hearing, since its network accepts no other.
     """
-    for path, each in list(found.items())[:1]:
+    for path, each in list(trainings.items())[:1]:
         for key in _OWN:
             read = operator.attrgetter(key.removeprefix("task."))
             given, held = read(settings.task), read(each.task)
@@ -166,14 +166,14 @@ def _check_own(settings: Any, found: Mapping[str, Trained]) -> None:
 
 def _value(words: list[str], key: str) -> str:
     """Finds the value of a key in arguments."""
-    found = [word.partition("=")[2] for word in words if word.partition("=")[0] == key]
-    return found[0] if found else "its default"
+    values = [word.partition("=")[2] for word in words if word.partition("=")[0] == key]
+    return values[0] if values else "its default"
 
 
 def _say(settings: Any, typed: Sequence[str]) -> str:
     """Describes in one line the robot and task that the policies run with."""
-    told = [word for word in typed if word.partition("=")[0].partition(".")[0] in _TOLD]
+    given = [word for word in typed if word.partition("=")[0].partition(".")[0] in _SHOWN]
     levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
-    found = describe(settings.robot, settings.task, settings.realism)
-    but = f" but for {' '.join(told)}" if told else ""
-    return f"as trained{but}: {found}; {settings.robot.body} body, {levels}"
+    what = describe(settings.robot, settings.task, settings.realism)
+    but = f" but for {' '.join(given)}" if given else ""
+    return f"as trained{but}: {what}; {settings.robot.body} body, {levels}"
