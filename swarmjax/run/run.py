@@ -115,7 +115,7 @@ class Run:
           StoppedError: if a stop was requested before there was anything to save.
         """
         hosts.join(self.settings)
-        with compile_cache.use(self.settings.run.compile_cache), self._display, hosts.lost_peers():
+        with compile_cache.use(self.settings.run.compile_cache), hosts.lost_peers():
             self._choose_arenas()
             with memory.refusal(self.settings), self._directory():
                 self.load()
@@ -274,6 +274,7 @@ class Run:
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (
+            self._display,  # leaves the last table on screen, before the last sentences
             Recorder(
                 self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
             ) as record,
