@@ -86,7 +86,7 @@ def _stages(last: Sequence[Row], names: Sequence[str]) -> str:
 
 
 class Display:
-    """Shows the run on a console, in a `with` block."""
+    """Shows the run on a console. The table of a terminal lives in a `with` block."""
 
     def __init__(self, console: Console | None = None) -> None:
         """Prepares a display; None: standard output."""

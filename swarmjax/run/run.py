@@ -115,7 +115,7 @@ class Run:
         """
         hosts.join(self.settings)
         refusal = memory.refusal(self.settings)
-        with compile_cache.use(), self._display, hosts.lost_peers(), refusal, self._directory():
+        with compile_cache.use(), hosts.lost_peers(), refusal, self._directory():
             self.load()
             if self.update < self.settings.updates:
                 self.compile()
@@ -258,6 +258,7 @@ class Run:
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (
+            self._display,  # leaves the last table on screen, before the last sentences
             Recorder(
                 self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
             ) as record,

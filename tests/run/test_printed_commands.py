@@ -50,7 +50,7 @@ def test_the_policy_is_judged_by_the_command_as_printed(
     words = KINDS[kind]
     assert train.main([*words, "budget=32", f"run.dir={tmp_path / kind}"]) == 0
     printed = capsys.readouterr().out
-    used = "reward turning times -0.0005, observation nearest_robot, level ring, network residual"
+    used = "reward turning, observation nearest_robot, level ring, network residual"
     assert (used in " ".join(printed.split())) == (kind == "own")
     arguments = _pasted(printed, "evaluate")
     assert evaluate.main([*arguments, "episodes=2", "steps=3", "workers=1"]) == 0
