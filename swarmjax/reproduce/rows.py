@@ -27,7 +27,12 @@ TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
 # Keys of a row of the evaluation. Each is measured over the row's episodes.
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot")
-_BY_ROBOT = ("reached", "reward", "robot_steps", "sensed", "contacts")
+# The kind of each value of a robot in `episodes.jsonl`.
+_BY_ROBOT = {
+    "reached": report_rows.FLAG,
+    "reward": report_rows.NUMBER,
+    **dict.fromkeys(("robot_steps", "sensed", "contacts"), report_rows.COUNT),
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,7 +151,11 @@ def summaries(out: Path) -> dict[str, Row]:
     """
     paths = {arm: out / arm / SUMMARY for arm in ARMS}
     every = {arm: report_rows.read_object(path) for arm, path in paths.items() if path.exists()}
-    return {arm: summary for arm, summary in every.items() if summary.get("budget_spent")}
+    finished = {arm: summary for arm, summary in every.items() if summary.get("budget_spent")}
+    for arm, summary in finished.items():
+        times = ("train_s", "compile_s")
+        report_rows.check(summary, times, report_rows.NUMBER_OR_NULL, str(paths[arm]))
+    return finished
 
 
 def read_rows(out: Path) -> list[Row]:
@@ -158,7 +167,15 @@ def read_rows(out: Path) -> list[Row]:
     path = out / EVALUATION
     if not path.exists():
         return []
-    return _read_object(path)["rows"]
+    rows = _read_object(path).get("rows")
+    if not isinstance(rows, list) or not all(map(report_rows.MAP.fits, rows)):
+        raise ConfigError(f"{path} has no list of rows: remove it to judge again.")
+    for number, row in enumerate(rows, 1):
+        where = f"{path}, row {number},"
+        report_rows.check(row, ("seed",), report_rows.WHOLE, where)
+        report_rows.check(row, ("arm", "stage"), report_rows.NAME, where)
+        report_rows.check(row, JUDGED, report_rows.NUMBER, where)
+    return rows
 
 
 def _read_object(path: Path) -> Row:
@@ -175,7 +192,13 @@ def _read_object(path: Path) -> Row:
 def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     """Reads the episodes of an arm, by seed."""
     by_seed: dict[int, list[Row]] = {seed: [] for seed in seeds}
-    for _, row in report_rows.read_lines(run, EPISODES):
+    for where, row in report_rows.read_lines(run, EPISODES):
+        report_rows.check(row, ("seed", "arena_steps", "robots"), report_rows.WHOLE, where)
+        report_rows.check(row, ("stage",), report_rows.NAME, where)
+        for key, kind in _BY_ROBOT.items():
+            report_rows.check(row, (key,), report_rows.list_of(kind, row["robots"]), where)
+        if row["seed"] not in by_seed:
+            raise ConfigError(f"{where} has seed {row['seed']}, which is not in {FACTS}.")
         by_seed[row["seed"]].append(row)
     for seed, rows in by_seed.items():
         if not rows:

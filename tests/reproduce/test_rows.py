@@ -83,6 +83,11 @@ def _change(out: Path, name: str, **given: object) -> None:
     (out / name).write_text(json.dumps(found | given))
 
 
+def _append(out: Path, **given: object) -> None:
+    with (out / "baseline" / "episodes.jsonl").open("a") as file:
+        file.write(json.dumps(episode(99) | given) + "\n")
+
+
 def _drop(out: Path, text: str) -> None:
     """Removes the lines that contain `text` from the baseline's log."""
     path = out / "baseline" / "episodes.jsonl"
@@ -106,11 +111,19 @@ REFUSED = {
         lambda out: [_change(out, f"{arm}/summary.json", budget_spent=False) for arm in PAIR],
         "no finished arm",
     ),
+    "seconds": (lambda out: _change(out, "baseline/summary.json", train_s="x"), "as train_s"),
     "no log": (
         lambda out: (out / "baseline" / "episodes.jsonl").unlink(),
         "baseline has no episodes.jsonl",
     ),
     "a seed": (lambda out: _drop(out, '"seed": 2'), "no episode of seed 2"),
+    "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
+    "lengths": (lambda out: _append(out, sensed=[1]), "has no list of 2 whole numbers as sensed"),
+    "no robots": (lambda out: _append(out, robots=0), "as reached"),
+    "kinds": (lambda out: _append(out, reached=[1, 0]), "as reached"),
+    "counts": (lambda out: _append(out, contacts=[-1, 0]), "as contacts"),
+    "nan": (lambda out: _append(out, reward=[float("nan"), 0.0]), "as reward"),
+    "stage": (lambda out: _append(out, stage=6), "as stage"),
     "no evaluation": (
         lambda out: (out / "evaluation.json").unlink(),
         "evaluation.json has no row of arm curriculum, seed 0 on paper6",
@@ -118,6 +131,23 @@ REFUSED = {
     "rows": (
         lambda out: _change(out, "evaluation.json", rows=[row("baseline", 0, LAST)]),
         "has no row of arm curriculum, seed 0 on paper6",
+    ),
+    "no rows": (
+        lambda out: _change(out, "evaluation.json", rows=None),
+        "has no list of rows: remove it to judge again.",
+    ),
+    "a row": (lambda out: _change(out, "evaluation.json", rows=[[]]), "has no list of rows"),
+    "a row's seed": (
+        lambda out: _change(
+            out, "evaluation.json", rows=[row("baseline", 0, LAST) | {"seed": [0]}]
+        ),
+        "row 1, has no whole number as seed",
+    ),
+    "a measure": (
+        lambda out: _change(
+            out, "evaluation.json", rows=[row("baseline", 0, LAST, all_reached=float("inf"))]
+        ),
+        "as all_reached",
     ),
 }
 
