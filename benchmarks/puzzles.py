@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks import lines
 from swarmjax import command, provenance
-from swarmjax.config import ConfigError, Section, about, build, files, reading, show
+from swarmjax.config import ConfigError, Section, about, build, reading, show
 from swarmjax.evaluate import cells
 from swarmjax.evaluate.cells import Cell, Suite
 from swarmjax.evaluate.suite_config import SUITE_SEED
@@ -81,7 +81,7 @@ class PuzzlesConfig(Section):
 
 def layouts() -> dict[str, tuple[str, ...]]:
     """Returns the rows of each puzzle's layout, by the name of the puzzle."""
-    return {name: tuple(text.split()) for name, text in files.read_yaml(LAYOUTS).items()}
+    return {name: tuple(text.split()) for name, text in reading.read_yaml(LAYOUTS).items()}
 
 
 # --- the grid

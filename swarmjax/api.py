@@ -110,8 +110,8 @@ def make_env(
     words, stages = _given({"stage": stage, **named, "arenas": arenas, **_NOT_LEARNING})
     config = load_train(words, stages=stages)
     most = {key: max(getattr(each, key) for each in config.stage) for key in _ROOM}
-    told = _flat(named)
-    left = {f"max_{key}": value for key, value in most.items() if f"sim.max_{key}" not in told}
+    typed = files.flatten(named)
+    left = {f"max_{key}": value for key, value in most.items() if f"sim.max_{key}" not in typed}
     return environment.load(replace(config, sim=replace(config.sim, **left)))
 
 
@@ -268,7 +268,7 @@ def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]]
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))
     if "extensions" in rest:
         rest["extensions"] = extension.hand_over(rest["extensions"])
-    return [f"{key}={value}" for key, value in _flat(rest).items()], stages
+    return [f"{key}={_typed(value)}" for key, value in files.flatten(rest).items()], stages
 
 
 def _stages(given: Any) -> list[dict[str, Any]]:
@@ -296,15 +296,6 @@ def _mapping(settings: Settings) -> dict[str, Any]:
     return {key: value for key, _, value in (word.partition("=") for word in settings)}
 
 
-def _flat(given: Mapping[str, Any], where: str = "") -> dict[str, str]:
-    """Flattens nested settings: returns values by dotted key, both written as on a command line."""
-    found: dict[str, str] = {}
-    for key, value in given.items():
-        value = to_dict(value) if isinstance(value, Section) else value
-        if isinstance(value, Mapping):
-            found |= _flat(value, f"{where}{key}.")
-        elif isinstance(value, str | Path):  # names, paths and typed values
-            found[f"{where}{key}"] = str(value)
-        else:
-            found[f"{where}{key}"] = files.write(value)
-    return found
+def _typed(value: Any) -> str:
+    """Writes a value as on a command line. Names, paths and words stay as they are."""
+    return str(value) if isinstance(value, str | Path) else files.write(value)

@@ -78,7 +78,7 @@ def _renew(settings: SuiteConfig) -> Suite:
     file = read_suite(settings.suite)
     suite = Suite(file.name, tuple(map(cells.draw_cell, file.cells)))
     path = files.named_path("suites", settings.suite, "suite")
-    content = files.read_yaml(path)
+    content = reading.read_yaml(path)
     for entry, cell in zip(content["cells"], suite.cells, strict=True):
         entry["digest"] = cell.digest
     try:
@@ -100,7 +100,7 @@ def to_yaml(content: dict[str, Any]) -> str:
     """Formats a suite's file: a line for each key, with lists of numbers wrapped.
 
     Args:
-      content: Plain data, as from `files.read_yaml`.
+      content: Plain data, as from `reading.read_yaml`.
 
     Returns:
       The text.

@@ -9,7 +9,7 @@ import steering
 import yaml
 
 from swarmjax import command, suite
-from swarmjax.config import files
+from swarmjax.config import reading
 from swarmjax.evaluate import cells
 from swarmjax.suite import SuiteConfig
 
@@ -122,7 +122,7 @@ def test_words_that_yaml_reads_otherwise_are_quoted(tmp_path: Path, word: str) -
     content = {"name": word, "cells": [{"name": word, "stage": {"name": word, "robots": 1}}]}
     path = tmp_path / "x.yaml"
     path.write_text(suite.to_yaml(content))
-    assert yaml.safe_load(path.read_text()) == files.read_yaml(path) == content
+    assert yaml.safe_load(path.read_text()) == reading.read_yaml(path) == content
     assert (f'"{word}"' in path.read_text()) == (word not in ("real", "a-b_c", "y"))
 
 
@@ -142,7 +142,7 @@ def test_a_written_suite_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text(suite.to_yaml(content))
     assert max(map(len, path.read_text().splitlines())) <= 100
-    assert files.read_yaml(path) == content
+    assert reading.read_yaml(path) == content
 
 
 @pytest.mark.parametrize(

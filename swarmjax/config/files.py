@@ -160,7 +160,8 @@ def choices(group: str) -> list[str]:
 
 def defaults(command: str) -> dict[str, str]:
     """Returns the groups of a command and the choices in its file; none if it has no file."""
-    return read_file(command) if (_config_dir() / f"{command}.yaml").exists() else {}
+    path = _config_dir() / f"{command}.yaml"
+    return reading.read_yaml(path) if path.exists() else {}
 
 
 def describe_groups(cls: type[Section]) -> list[str]:
@@ -175,28 +176,9 @@ def describe_groups(cls: type[Section]) -> list[str]:
 
 
 def _config_dir() -> Path:
-    """Finds configs/: at the root of the source tree, otherwise inside the installed package."""
-    root = _PACKAGE.parent
-    source, installed = root / "configs", _PACKAGE / "configs"
-    # The folder above an installed package also holds other packages. A folder configs/ there is
-    # ours only if the project file is next to it.
-    if (root / "pyproject.toml").is_file() and source.is_dir():
-        return source
-    if installed.is_dir():
-        return installed
-    raise ConfigError(f"configs is missing: neither {source} nor {installed} is a folder.")
-
-
-def read_file(name: str) -> dict[str, Any]:
-    """Reads one file of configs/ without composing it.
-
-    Args:
-      name: path of the file in configs/, without the ending, such as `stage/s6`.
-
-    Raises:
-      ConfigError: if the file cannot be read.
-    """
-    return read_yaml(_config_dir() / f"{name}.yaml")
+    """Finds configs/: inside the installed package, otherwise at the root of the source tree."""
+    installed = _PACKAGE / "configs"
+    return installed if installed.is_dir() else _PACKAGE.parent / "configs"
 
 
 def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, Any]:
@@ -210,23 +192,7 @@ def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, An
     Raises:
       ConfigError: if there is no such file, or it cannot be read.
     """
-    return read_yaml(named_path(group, choice, key or group))
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a file of keys and values without composing it.
-
-    Raises:
-      ConfigError: if the file cannot be read, or does not hold keys and values.
-    """
-    mapping = reading.read_yaml(path)
-    if mapping is None:
-        return {}
-    if not isinstance(mapping, dict):
-        raise ConfigError(
-            f"{reading.called(path)} is not a list of keys and values: write key: value."
-        )
-    return mapping
+    return reading.read_yaml(named_path(group, choice, key or group))
 
 
 def preset_of(group: str, held: Section) -> str:
@@ -297,26 +263,17 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
         if key in derived:
             advice = [f": choose a file, as in {root}={name}" for name in choices(root)[-1:]]
             raise ConfigError(f"{key} cannot be given{''.join(advice)}.")
-        if choices(key):
+        is_text = key in known and str in values.options(known[key].type)
+        if choices(key) or is_text:
             check_text(key, value)
+        if choices(key):
             found[key] = value.strip("'\"")
-        elif key in known and str in values.options(known[key].type):
-            found[key] = _text(key, value)
+        elif is_text and value != "null" and value[:1] not in ("'", '"'):
+            found[key] = value  # without quotes, so that a path may contain any character
         else:
-            found[key] = _value(key, value)
+            where = f"{key} is {show(value)}, which cannot be read: "
+            found[key] = reading.parse_yaml(value, where)
     return found
-
-
-def _text(key: str, value: str) -> Any:
-    """Reads a text, which needs no quotes, so that a path may contain any character."""
-    check_text(key, value)
-    if value == "null":
-        return None
-    return _value(key, value) if value[:1] in ("'", '"') else value
-
-
-def _value(key: str, value: str) -> Any:
-    return reading.parse_yaml(value, f"{key} is {show(value)}, which cannot be read: ")
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
@@ -341,6 +298,26 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
                 )
         inner[last] = value
     return found
+
+
+def flatten(nested: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Returns nested settings as values by dotted key; the reverse of `nest`.
+
+    Args:
+      nested: plain data; a section counts as its plain data.
+      where: the prefix of the keys.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in nested.items():
+        value = section.to_dict(value) if isinstance(value, Section) else value
+        inner = isinstance(value, Mapping)
+        flat |= flatten(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
+    return flat
+
+
+def write_words(nested: Mapping[str, Any]) -> list[str]:
+    """Writes nested plain data as `key=value` words."""
+    return [f"{key}={write(value)}" for key, value in flatten(nested).items()]
 
 
 def write(value: Any) -> str:

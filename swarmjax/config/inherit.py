@@ -3,7 +3,7 @@
 The last word for a key counts, so typed words win.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from swarmjax.config import files, section
@@ -28,11 +28,10 @@ def group_words(
     given = files.parse(cls, typed)
     own = files.read_choice(group, given[group]) if group in given else {}
     left = {*skip, *own.get(group, own)}  # in a file for the whole config, each group is nested
-    cls_held = type(held)
-    default, derived = section.to_dict(cls_held()), section.keys(cls_held, derived=True)
+    derived = section.keys(type(held), derived=True)
     return [
         f"{group}.{key}={files.write(value)}"
-        for key, value in _differences(section.to_dict(held), default)
+        for key, value in _differences(held, type(held)()).items()
         if key not in derived and key.partition(".")[0] not in left
     ]
 
@@ -53,18 +52,10 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
     if group in files.parse(cls, typed):
         return []
     preset = section.build(type(held), files.read_choice(group, held.name))
-    found = _differences(section.to_dict(held), section.to_dict(preset))
-    return [
-        f"{group}={held.name}",
-        *(f"{group}.{key}={files.write(value)}" for key, value in found),
-    ]
+    return [f"{group}={held.name}", *files.write_words({group: _differences(held, preset)})]
 
 
-def _differences(held: Mapping[str, Any], other: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yields the dotted keys and values that differ from another section."""
-    for key, value in held.items():
-        if isinstance(value, Mapping):
-            inner = _differences(value, other.get(key, {}))
-            yield from ((f"{key}.{name}", each) for name, each in inner)
-        elif key not in other or value != other[key]:
-            yield key, value
+def _differences(held: Section, other: Section) -> dict[str, Any]:
+    """Returns the values by dotted key that differ from another section."""
+    mine, its = (files.flatten(section.to_dict(each)) for each in (held, other))
+    return {key: value for key, value in mine.items() if key not in its or value != its[key]}

@@ -23,7 +23,6 @@ _MOST_LINE = 2**24  # bytes in one line of a file with one object per line
 MOST_VALUES = 10_000
 _MOST_DEPTH = 32  # nested lists and mappings
 _TOO_DEEP = f"lists or mappings are nested more than {_MOST_DEPTH} deep."
-_MOST_SCALAR = 5000  # letters of one value; a path may have 4096
 
 
 def read_bytes(path: Path, most: int = MOST_TYPED) -> bytes:
@@ -117,14 +116,8 @@ def parse_json(text: str, where: str) -> Any:
     """
     try:
         found = json.loads(text)
-    except RecursionError:
-        raise ConfigError(f"{where} cannot be read: {_TOO_DEEP}") from None
-    except json.JSONDecodeError as error:
-        raise ConfigError(
-            f"{where} cannot be read: it is not JSON, {str(error).lower()}."
-        ) from None
-    except ValueError:
-        raise ConfigError(f"{where} cannot be read: a number has too many digits.") from None
+    except (RecursionError, ValueError) as error:
+        raise ConfigError(f"{where} cannot be read as JSON: {_first_line(error)}.") from None
     if _depth(found) > _MOST_DEPTH:  # it would break writing or comparing the value later
         raise ConfigError(f"{where} cannot be read: {_TOO_DEEP}")
     return found
@@ -158,19 +151,19 @@ def read_lines(path: Path) -> Iterator[bytes]:
 # YAML
 
 
-def read_yaml(path: Path) -> Any:
-    """Reads a YAML file.
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Reads a YAML file of keys and values; an empty file has none.
 
     Args:
       path: the file.
 
-    Returns:
-      Its content as plain data.
-
     Raises:
-      ConfigError: as in `read_text` and `parse_yaml`.
+      ConfigError: as in `read_text` and `parse_yaml`, or if the file holds anything else.
     """
-    return parse_yaml(read_text(path), f"{called(path)} cannot be read: ")
+    content = parse_yaml(read_text(path), f"{called(path)} cannot be read: ")
+    if not isinstance(content, dict | None):
+        raise ConfigError(f"{called(path)} is not a list of keys and values: write key: value.")
+    return content or {}
 
 
 def parse_yaml(text: str, where: str) -> Any:
@@ -213,8 +206,6 @@ def _measure(events: Iterable[Any], where: str) -> None:
             raise ConfigError(f"{where}it has the tag {show(event.tag)}: remove it.")
         if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for billions
             raise ConfigError(f"{where}it has the alias *{event.anchor}: write the value itself.")
-        if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MOST_SCALAR:
-            raise ConfigError(f"{where}a value has more than {_MOST_SCALAR} characters.")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         count += isinstance(event, yaml.CollectionStartEvent | yaml.ScalarEvent)
@@ -225,15 +216,12 @@ def _measure(events: Iterable[Any], where: str) -> None:
 
 
 # The decimal scalars of YAML 1.2's core schema (yaml.org/spec/1.2.2, section 10.3.2), by PyYAML's
-# name for them: the pattern, and the letters that may come first. Anything else is text.
+# name for them. Anything else is text.
 _SCALARS = {
-    "null": (r"null|Null|NULL|~|", ["n", "N", "~", ""]),
-    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
-    "int": (r"[-+]?[0-9]+", [*"-+0123456789"]),
-    "float": (
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        [*"-+0123456789."],
-    ),
+    "null": r"null|Null|NULL|~|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?\d+",
+    "float": r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
 }
 
 
@@ -258,9 +246,9 @@ def _loader() -> Any:
                 found[name] = self.construct_object(value, deep=deep)
             return found
 
-    for name, (pattern, first) in _SCALARS.items():
+    for name, pattern in _SCALARS.items():
         tag = f"tag:yaml.org,2002:{name}"
-        Loader.add_implicit_resolver(tag, re.compile(f"^(?:{pattern})$"), first)
+        Loader.add_implicit_resolver(tag, re.compile(f"^(?:{pattern})$", re.ASCII), None)
     # PyYAML would read 010 as 8, as in YAML 1.1.
     Loader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.value))
     return Loader

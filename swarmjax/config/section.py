@@ -171,8 +171,8 @@ def _leaves(value: object) -> Iterator[object]:
 def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "") -> C:
     """Makes a section from plain data, strictly.
 
-    Whole numbers become integers or floats, numeric strings become numbers, and lists become
-    tuples. Nothing else is converted, and no key is dropped.
+    Whole numbers become integers or floats, and lists become tuples. Nothing else is converted, and
+    no key is dropped.
 
     Args:
       cls: the dataclass to make.

@@ -5,6 +5,7 @@ import math
 import re
 import types
 import typing
+import unicodedata
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -82,18 +83,13 @@ def _convert(hint: object, value: object) -> object:
 
 
 def _number(kind: type[int] | type[float], value: object) -> int | float:
-    """Converts a number or a numeric string. True and false are not numbers."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
+    """Converts a finite number. True and false are not numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError
-    try:
-        number: int | float = int(value) if isinstance(value, str) else value
-    except ValueError:
-        number = float(value)
-    if isinstance(number, float) and not math.isfinite(number):
+    number = kind(value)  # nan and infinity are no integers
+    if number != value if kind is int else not math.isfinite(number):
         raise ValueError
-    if kind is int and number != int(number):
-        raise ValueError
-    return kind(number)
+    return number
 
 
 def check_text(key: str, text: str) -> None:
@@ -106,13 +102,10 @@ def check_text(key: str, text: str) -> None:
     Raises:
       ConfigError: if the text has a control character, too long a name, or no valid Unicode.
     """
-    if any(ord(letter) < 32 or 127 <= ord(letter) < 160 for letter in text):
-        raise ConfigError(f"{key} is {show(text)}: give text without control characters.")
-    try:
-        names = re.split(b"[/,]", text.encode())
-    except UnicodeEncodeError:
-        raise ConfigError(f"{key} is {show(text)}: give text in UTF-8.") from None
-    longest = max(map(len, names))
+    # "Cs" are halves of letters, which UTF-8 cannot hold.
+    if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text):
+        raise ConfigError(f"{key} is {show(text)}: give UTF-8 text without control characters.")
+    longest = max(map(len, re.split(b"[/,]", text.encode())))
     if longest > _MOST_NAME:
         raise ConfigError(
             f"{key} is {show(text)}, with a name of {longest} bytes: give at most {_MOST_NAME}."

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from swarmjax.config import ConfigError, Section, about, build, files, show
+from swarmjax.config import ConfigError, Section, about, build, files, reading, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
 from swarmjax.sim.config import MOST_HULL_FRICTION, RobotConfig
@@ -95,7 +95,7 @@ def read_suite(choice: str) -> SuiteFileConfig:
       ConfigError: There is no such file, or it is unsound.
     """
     path = files.named_path("suites", choice, "suite")
-    mapping = files.read_yaml(path)
+    mapping = reading.read_yaml(path)
     cells = mapping.get("cells")
     if isinstance(cells, list):
         mapping = mapping | {"cells": [_cell(cell, path.parent) for cell in cells]}

@@ -5,11 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from swarmjax import words
-from swarmjax.config import to_dict
+from swarmjax.config import files, to_dict
 from swarmjax.pages import builder
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History, Row
-from swarmjax.run.load_settings import leaves
 
 STYLES = (builder.STYLE, "report/report.css")
 
@@ -49,7 +48,7 @@ def facts(history: History) -> list[tuple[str, str]]:
       The heading and the text of each line.
     """
     trained, names = history.config, history.names
-    options = leaves(to_dict(trained.curriculum))
+    options = files.flatten(to_dict(trained.curriculum))
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"

@@ -13,13 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swarmjax.config import ConfigError, check_text, show, to_dict
+from swarmjax.config import ConfigError, check_text, files, show, to_dict
 from swarmjax.config.section import keys
 from swarmjax.evaluate.statistics import LEAST_DRAWN, bootstrap
 from swarmjax.report import rows
 from swarmjax.report.rows import History
 from swarmjax.run.directory import CONFIG, METRICS
-from swarmjax.run.load_settings import leaves
 from swarmjax.run.settings import TrainConfig
 
 # Runs on one line may differ in these settings: which seeds they have, and how they ran.
@@ -111,7 +110,7 @@ def read(runs: Sequence[Path]) -> list[TableLine]:
     for run in runs:
         history = rows.read(run)
         groups.setdefault(json.dumps(_settings(history)), []).append((run, history))
-    flat = [leaves(json.loads(key)) for key in groups]
+    flat = [files.flatten(json.loads(key)) for key in groups]
     return [
         join(group, _differences(each, flat))
         for each, group in zip(flat, groups.values(), strict=True)

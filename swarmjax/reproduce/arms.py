@@ -9,7 +9,7 @@ from pathlib import Path
 from swarmjax.config import files, to_dict
 from swarmjax.reproduce.config import Arm, ReproduceConfig
 from swarmjax.run.display import Display
-from swarmjax.run.load_settings import leaves, load_run, load_train
+from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
@@ -35,7 +35,7 @@ def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
     first, kind = arm.removesuffix("_expanded"), arm.removeprefix("modern_")
     trainer = [*PAPER]
     if arm.startswith("modern_"):
-        task = leaves(to_dict(load_train(PAPER).task), "task.")
+        task = files.flatten(to_dict(load_train(PAPER).task), "task.")
         trainer = [*MODERN, *(f"{key}={files.write(value)}" for key, value in task.items())]
     if arm == first:
         trainer += [f"stage={_STAGES[kind]}", f"budget={given.budget}"]

@@ -17,9 +17,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from swarmjax import provenance
-from swarmjax.config import ConfigError, show, to_dict
+from swarmjax.config import ConfigError, files, show, to_dict
 from swarmjax.run.errors import LostPeerError
-from swarmjax.run.load_settings import leaves
 from swarmjax.run.settings import TrainConfig
 
 CHECKPOINTS = "checkpoints"  # folder in a run directory
@@ -202,7 +201,9 @@ def _check_alike(settings: TrainConfig) -> None:
 
 def _comparable(settings: TrainConfig) -> dict[str, Any]:
     """Returns the settings and versions that all processes must share, by dotted key."""
-    found = {key: value for key, value in leaves(to_dict(settings)).items() if key not in _OWN}
+    found = {
+        key: value for key, value in files.flatten(to_dict(settings)).items() if key not in _OWN
+    }
     return found | {f"version of {name}": value for name, value in provenance.versions().items()}
 
 

@@ -238,7 +238,8 @@ def _go_on_or_begin(
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
     """Refuses to resume a run with other settings than its own, and names the keys that differ."""
     mine, its = (
-        leaves({k: v for k, v in each.items() if k not in MAY_CHANGE}) for each in (typed, stored)
+        files.flatten({k: v for k, v in each.items() if k not in MAY_CHANGE})
+        for each in (typed, stored)
     )
     changed = [key for key in mine if mine[key] != its.get(key)]
     if changed:
@@ -247,17 +248,3 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
             f"resume is auto, but {run} holds a run with other settings: {shown}. A resumed run "
             f"may change only {', '.join(_RESUME_KEYS)}: give its own settings, or another run.dir."
         )
-
-
-def leaves(found: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Flattens nested settings to dotted keys.
-
-    Args:
-      found: plain data, as `to_dict` gives it.
-      where: the prefix of its keys.
-    """
-    flat: dict[str, Any] = {}
-    for key, value in found.items():
-        inner = isinstance(value, Mapping)
-        flat |= leaves(value, f"{where}{key}.") if inner else {f"{where}{key}": value}
-    return flat

@@ -3,11 +3,10 @@
 Recipes are made to be passed on, so they are data: `TrainConfig.shared` lists what they may set.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from swarmjax.config import ConfigError, Section, files, show
+from swarmjax.config import ConfigError, Section, files, reading, show
 
 
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
@@ -45,11 +44,11 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
     """Returns the own words of a recipe, and the choice of the recipe that it extends."""
-    found = files.read_yaml(path)
+    found = reading.read_yaml(path)
     base = found.pop("recipe", None)
     files.check_shared(cls, found, path)
     choices, values = files.of_file(found, path.parent)
-    words = [*_words(choices), *_words(values)]
+    words = files.write_words({**choices, **values})
     try:
         files.parse(cls, words)
         if not isinstance(base, str | None):
@@ -59,12 +58,3 @@ def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return words, None if base is None else files.beside(path.parent, base)
-
-
-def _words(settings: Mapping[str, Any], where: str = "") -> Iterator[str]:
-    """Yields nested settings as `key=value` words."""
-    for key, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _words(value, f"{where}{key}.")
-        else:
-            yield f"{where}{key}={files.write(value)}"

@@ -73,7 +73,7 @@ def test_round_trip_of_any_sound_configuration(
 # The converter
 
 
-@pytest.mark.parametrize("value", [4096, 4096.0, "4096", "4096.0", "4.096e3"])
+@pytest.mark.parametrize("value", [4096, 4096.0])
 def test_whole_numbers_become_integers(value):
     budget = build(TrainConfig, {"stage": [STAGE], "budget": value}).budget
     assert (budget, type(budget)) == (4096, int)
@@ -84,20 +84,19 @@ def test_hydra_reads_an_exponent_as_a_float_and_we_as_an_integer():
     assert (budget, type(budget)) == (1_000_000, int)
 
 
-@pytest.mark.parametrize("value", [1, "1", "1e0"])
-def test_integers_become_floats(value):
-    progress = build(RewardConfig, {"progress": value}).progress
+def test_integers_become_floats():
+    progress = build(RewardConfig, {"progress": 1}).progress
     assert (progress, type(progress)) == (1.0, float)
 
 
 def test_a_long_integer_keeps_every_digit():
     # 2**53 + 1 is the first integer that a float cannot hold.
     with pytest.raises(ConfigError, match="9007199254740993"):
-        build(TrainConfig, {"stage": [STAGE], "seed": "9007199254740993"})
+        build(TrainConfig, {"stage": [STAGE], "seed": 9007199254740993})
 
 
 @pytest.mark.parametrize(
-    "value", [True, None, "many", "", 1.5, math.nan, math.inf, "nan", "inf", [8], {"a": 1}]
+    "value", [True, None, "many", "4096", "", 1.5, math.nan, math.inf, "nan", "inf", [8], {"a": 1}]
 )
 def test_what_is_no_whole_number_is_refused(value):
     sentence = refusal(build, TrainConfig, {"stage": [STAGE], "arenas": value})
@@ -132,7 +131,7 @@ def test_null_only_where_it_is_allowed():
     )
 
 
-@pytest.mark.parametrize(("value", "made"), [("auto", "auto"), (3.0, 3), ("4", 4)])
+@pytest.mark.parametrize(("value", "made"), [("auto", "auto"), (3.0, 3)])
 def test_chunk_takes_a_number_or_a_word(value, made):
     assert build(RunConfig, {"chunk": value}).chunk == made
 
