@@ -27,28 +27,31 @@ _WHOLE = "algo"
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
-def compose(cls: type[Section], overrides: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Composes a command's files and words. Words override files.
+def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete | None = None) -> C:
+    """Makes a command's settings from its files and its `key=value` words. Words override files.
 
     Args:
-      cls: the command's dataclass, which defines its keys.
-      overrides: `key=value` words.
+      cls: the command's dataclass. Its `command` names the file in configs/.
+      overrides: the words.
+      complete: a function that takes the composed data and the choice of each group, and returns
+        the keys and values to check. None checks the composed data itself.
 
     Returns:
-      The keys and values from all sources, and the choice of each group.
+      The settings.
 
     Raises:
-      ConfigError: if a word, a choice or a file is invalid.
+      ConfigError: if a word, a choice, a file or a value is invalid.
     """
     flat = parse(cls, overrides)
     first, typed = defaults(cls.command), {k: choice for k, choice in flat.items() if choices(k)}
     by_whole, values = _read_whole(cls, (first | typed).get(_WHOLE))
     chosen = first | by_whole | typed
-    found = {
+    by_group = {
         group: read_choice(group, choice) for group, choice in chosen.items() if group != _WHOLE
     }
     others = nest({key: value for key, value in flat.items() if key not in typed})
-    return merge(merge(found, values), others), chosen
+    mapping = merge(merge(by_group, values), others)
+    return section.build(cls, complete(mapping, chosen) if complete else mapping)
 
 
 def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str], dict[str, Any]]:
@@ -131,25 +134,6 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete | None = None) -> C:
-    """Makes a command's settings from its files and its `key=value` words. All commands use it.
-
-    Args:
-      cls: the command's dataclass. Its `command` names the file in configs/.
-      overrides: the words.
-      complete: a function that takes the composed data and the choice of each group, and returns
-        the keys and values to check. None checks the composed data itself.
-
-    Returns:
-      The settings.
-
-    Raises:
-      ConfigError: if a word, a choice, a file or a value is invalid.
-    """
-    mapping, chosen = compose(cls, overrides)
-    return section.build(cls, complete(mapping, chosen) if complete else mapping)
-
-
 # Files
 
 
@@ -193,19 +177,6 @@ def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, An
       ConfigError: if there is no such file, or it cannot be read.
     """
     return reading.read_yaml(named_path(group, choice, key or group))
-
-
-def preset_of(group: str, held: Section) -> str:
-    """Returns the name of the preset whose values a section has; `custom` if no preset has them."""
-    derived = section.keys(type(held), derived=True)
-
-    def numbers(of: Section) -> dict[str, Any]:
-        return {key: value for key, value in section.to_dict(of).items() if key not in derived}
-
-    for name in choices(group):
-        if numbers(section.build(type(held), read_choice(group, name))) == numbers(held):
-            return name
-    return "custom"
 
 
 def named_path(folder: str, choice: str, key: str) -> Path:

@@ -55,6 +55,16 @@ def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]
     return [f"{group}={held.name}", *files.write_words({group: _differences(held, preset)})]
 
 
+def preset_of(group: str, held: Section) -> str:
+    """Returns the name of the preset whose values a section has; `custom` if no preset has them."""
+    derived = section.keys(type(held), derived=True).keys()
+    for name in files.choices(group):
+        preset = section.build(type(held), files.read_choice(group, name))
+        if _differences(held, preset).keys() <= derived:
+            return name
+    return "custom"
+
+
 def _differences(held: Section, other: Section) -> dict[str, Any]:
     """Returns the values by dotted key that differ from another section."""
     mine, its = (files.flatten(section.to_dict(each)) for each in (held, other))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from swarmjax import epuck, extension, policy_file, provenance
-from swarmjax.config import files, to_dict
+from swarmjax.config import inherit, to_dict
 from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run import checkpoint
@@ -83,11 +83,11 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
             "high": [robot.max_speed, robot.max_turn_rate],
         },
         "robot": {
-            "preset": files.preset_of("robot", robot),
+            "preset": inherit.preset_of("robot", robot),
             **to_dict(robot),
         },
         "sensors": {
-            "preset": files.preset_of("realism", trained.realism),
+            "preset": inherit.preset_of("realism", trained.realism),
             "response": trained.realism.infrared,
             "range": trained.task.sensor_range,
             "poses": [list(pose) for pose in epuck.SENSOR_POSES],

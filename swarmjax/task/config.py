@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, files, show
+from swarmjax.config import ConfigError, Section, about, inherit, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
@@ -118,7 +118,7 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
         f"hull {robot.hull_radius:g} m{rubs}, infrared to {task.sensor_range:g} m, at most "
         f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
         f"{task.control_step:g} s, arrival {task.arrival}, realism "
-        f"{files.preset_of('realism', realism)}"
+        f"{inherit.preset_of('realism', realism)}"
     )
 
 

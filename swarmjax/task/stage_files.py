@@ -19,7 +19,7 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     """Returns all stages that a choice of the group `stage` names, as plain data.
 
     Args:
-      stage: data of the group, from `files.compose`.
+      stage: data of the group, from `files.load`.
       choice: the name of its file.
 
     Raises:
@@ -40,7 +40,7 @@ def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     """Returns the stage that a choice of the group `stage` names, if it is a single one.
 
     Args:
-      stage: data of the group, from `files.compose`.
+      stage: data of the group, from `files.load`.
       choice: the name of its file.
 
     Raises:
