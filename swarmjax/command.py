@@ -7,7 +7,7 @@ import inspect
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any, TextIO
@@ -42,18 +42,17 @@ def run(
     Returns:
       The exit code: 2 for the user's errors, which are printed in one sentence.
     """
-    with outputs_kept(_module(name)) as ended:
-        return ended(_run(name, main, settings, also))
+    module = _module(name)
+    return with_outputs(module, lambda: _run(module, main, settings, also))
 
 
 def _run(
-    name: str,
+    module: str,
     main: Callable[[Sequence[str]], int],
     settings: type,
     also: tuple[type[Exception], ...],
 ) -> int:
     arguments = sys.argv[1:]
-    module = _module(name)
     try:
         if HELP & set(arguments):
             topics = [word for word in arguments if word not in HELP and "=" not in word]
@@ -63,11 +62,12 @@ def _run(
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as error:
-        found = explain(error, also)
-        if found is None:
+        mistake = explain(error, also)
+        if mistake is None:
             raise
-        sys.stderr.write(f"{module}: error: {found[0]}\n")
-        return found[1]
+        sentence, code = mistake
+        sys.stderr.write(f"{module}: error: {sentence}\n")
+        return code
 
 
 def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[str, int] | None:
@@ -105,19 +105,16 @@ class _Stream:
 
     def write(self, text: str) -> int:
         """Writes text, or drops it."""
-        with self._dropped():
-            self._stream.write(text)
+        self._try(self._stream.write, text)
         return len(text)
 
     def flush(self) -> None:
         """Writes what is buffered, or drops it."""
-        with self._dropped():
-            self._stream.flush()
+        self._try(self._stream.flush)
 
-    @contextlib.contextmanager
-    def _dropped(self) -> Iterator[None]:
+    def _try(self, act: Callable[..., object], *text: str) -> None:
         try:
-            yield
+            act(*text)
         except OSError as error:
             self.error = self.error or error
             # Python flushes the stream again at exit. This must not fail again.
@@ -129,29 +126,25 @@ class _Stream:
         return getattr(self._stream, name)
 
 
-@contextlib.contextmanager
-def outputs_kept(module: str) -> Iterator[Callable[[int], int]]:
-    """Lets a command finish its work although nobody reads its output, in a `with` block.
+def with_outputs(module: str, work: Callable[[], int]) -> int:
+    """Lets a command finish its work although nobody reads its output.
 
     Args:
       module: name of the command in messages.
+      work: does the work, and returns the exit code.
 
-    Yields:
-      A function that takes the command's exit code, and returns the one to end with: 1 instead of
-      0 if standard output had no room.
+    Returns:
+      The exit code; 1 instead of 0 if standard output had no room.
     """
     before = sys.stdout, sys.stderr
     sys.stdout, sys.stderr = out, err = _Stream(sys.stdout), _Stream(sys.stderr)
-
-    def ended(code: int) -> int:
+    try:
+        code = work()
         out.flush()
         if out.error is None or isinstance(out.error, BrokenPipeError):
             return code
         err.write(f"{module}: error: standard output cannot be written: {out.error.strerror}.\n")
         return code or FAILED
-
-    try:
-        yield ended
     finally:
         out.flush()
         err.flush()
@@ -228,20 +221,23 @@ def _examples(module: str) -> list[str]:
 def _overview(cls: type[Section], module: str) -> list[str]:
     """Describes how to use a command, without the keys of its sections."""
     command = f"python {module}" if module.endswith(".py") else f"python -m {module}"
-    lines = [f"usage: {command} key=value ..."]
-    examples = _examples(module)
-    if examples:
-        lines += ["", *examples]
-    groups = files.describe_groups(cls) if cls.command else []
-    if groups:
-        lines += ["", "Groups, each a folder of configs/:", *groups]
     top = [key for key in section.keys(cls) if "." not in key]
-    if top:
-        lines += ["", "Keys, with their defaults:", *section.describe_keys(cls, top)]
-    inner = section.sections(cls)
-    if inner:
-        lines += ["", f"Sections of keys; {command} --help all lists all keys:"]
-    for name, each in inner.items():
+    blocks = (
+        _examples(module),
+        ["Groups, each a folder of configs/:", *files.describe_groups(cls)],
+        ["Keys, with their defaults:", *section.describe_keys(cls, top)],
+        [f"Sections of keys; {command} --help all lists all keys:", *_describe_sections(cls)],
+    )
+    lines = [f"usage: {command} key=value ..."]
+    for block in blocks:
+        lines += ["", *block] if len(block) > 1 else []
+    return lines
+
+
+def _describe_sections(cls: type[Section]) -> list[str]:
+    """Returns a line for each section of keys, with the first sentence about it."""
+    lines = []
+    for name, each in section.sections(cls).items():
         meaning = (inspect.getdoc(each) or "").partition("\n")[0].rstrip(".:;")
         lines.append(f"  {f'--help {name}':<38}  {name}.*: {meaning}")
     return lines

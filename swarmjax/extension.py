@@ -8,7 +8,6 @@ each kind. Loading a file executes it. Importing this module does not import JAX
 
 import ast
 import hashlib
-import importlib.util
 import inspect
 import linecache
 import re
@@ -203,11 +202,11 @@ class Extensions(NamedTuple):
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""
-        every = [pieces for pieces in self if pieces]
+        every = {pieces[0].kind: pieces for pieces in self if pieces}
         return ByName(
             {
-                pieces[0].kind: ByName({each.name: each.digest for each in pieces})
-                for pieces in every
+                kind: ByName({each.name: each.digest for each in pieces})
+                for kind, pieces in every.items()
             }
         )
 
@@ -284,10 +283,10 @@ def hand_over(given: object) -> str | None:
 def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
     """Runs a file as a module with a unique name, so that it cannot shadow another module."""
     name = f"_swarmjax_extension_{digest[:16]}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None:
+    if path.suffix != ".py":
         raise ConfigError(f"extensions is {show(str(path))}: give a file that ends in .py.")
-    module = importlib.util.module_from_spec(spec)
+    module = types.ModuleType(name)
+    module.__file__ = str(path)
     sys.modules[name] = module
     try:
         # Do not use cached bytecode or lines. Both caches may be out of date, since they compare
@@ -303,8 +302,7 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
 
 def _pieces(names: Mapping[str, object]) -> list[Piece]:
     """Lists the pieces among a module's names, without repeats."""
-    found = {id(value): value for value in names.values() if isinstance(value, Piece)}
-    return list(found.values())
+    return list(dict.fromkeys(value for value in names.values() if isinstance(value, Piece)))
 
 
 def collect(pieces: Iterable[Piece], where: str) -> Extensions:

@@ -12,17 +12,13 @@ Examples:
   python -m swarmjax.suite suite=my_suite.yaml write=true
 """
 
-import json
-import re
 import sys
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import yaml
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -36,8 +32,6 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.outputs import OVERWRITE, replacing
-
-_WIDTH = 100  # columns of a suite's file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,37 +91,24 @@ def _comment(path: Path) -> str:
 
 
 def to_yaml(content: dict[str, Any]) -> str:
-    """Formats a suite's file: a line for each key, with lists of numbers wrapped.
+    """Formats a suite's file, with a line for each key.
 
     Args:
-      content: Plain data, as from `reading.read_yaml`.
-
-    Returns:
-      The text.
+      content: plain data, as from `reading.read_yaml`.
     """
     lines = [f"{key}: {_flow(value)}" for key, value in content.items() if key != "cells"]
     lines.append("cells:")
     for cell in content["cells"]:
-        for i, (key, value) in enumerate(cell.items()):
-            head = f"  {' ' if i else '-'} {key}: "
-            lines += textwrap.wrap(
-                head + _flow(value),
-                _WIDTH,
-                subsequent_indent=" " * 6,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
+        first, *others = (f"{key}: {_flow(value)}" for key, value in cell.items())
+        lines += [f"  - {first}", *(f"    {line}" for line in others)]
     return "\n".join(lines) + "\n"
 
 
 def _flow(value: Any) -> str:
-    """Formats a value in YAML's flow style; quotes text only where YAML would misread it."""
-    if isinstance(value, dict):
-        items = (f"{_flow(key)}: {_flow(item)}" for key, item in value.items())
-        return "{" + ", ".join(items) + "}"
-    if isinstance(value, str) and re.fullmatch(r"[A-Za-z_][\w-]*", value, re.ASCII):
-        return value if yaml.safe_load(value) == value else json.dumps(value)
-    return json.dumps(value, ensure_ascii=False)
+    """Formats a value on one line, with quotes only around text that YAML could misread."""
+    if not isinstance(value, dict):
+        return files.write(value)
+    return "{" + ", ".join(f"{key}: {_flow(item)}" for key, item in value.items()) + "}"
 
 
 def _show(console: Console, suite: Suite) -> None:

@@ -15,7 +15,6 @@ import pytest
 
 import swarmjax
 from swarmjax.environment import Swarm, SwarmState
-from swarmjax.run import memory
 from swarmjax.task.stage_config import StageConfig
 
 PAIR = StageConfig(name="pair", robots=2, side=0.5)
@@ -153,13 +152,6 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     whole = swarmjax.train_policy(settings | {"run.dir": tmp_path / "whole"})
     assert first.policy.meta["update"] < second.policy.meta["update"]
     chex.assert_trees_all_equal(second.policy.layers, whole.policy.layers)
-
-
-@pytest.mark.slow
-def test_as_many_arenas_as_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "fill", lambda settings, measure, limit: (settings, "why"))
-    settings = TINY | {"run.dir": tmp_path / "run", "budget": 16, "arenas": "auto"}
-    assert swarmjax.train_policy(settings).policy.meta["config"]["arenas"] == 2
 
 
 @pytest.mark.slow

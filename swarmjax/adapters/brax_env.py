@@ -1,8 +1,9 @@
 """Brax: the robots of all arenas as a `brax.envs.base.Env`, for training with Brax's PPO."""
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,6 @@ from swarmjax.adapters.robots import line_up
 from swarmjax.environment import Swarm
 
 _base: Any = find("brax.envs.base", "brax")
-_DROPPED = "device_put_replicated"
 
 
 class SwarmBraxEnv(_base.Env):
@@ -85,8 +85,7 @@ class SwarmBraxEnv(_base.Env):
           action: [N, U] floats, clipped to -1..1.
 
         Raises:
-          ValueError: if the action has a wrong shape.
-          TypeError: if the action has a wrong dtype.
+          ValueError: if the action has a wrong shape or dtype.
         """
         check(action, (self.num_envs, self.action_size))
         steps = state.pipeline_state.arenas.clock[self.robots.arena] + 1.0
@@ -104,9 +103,8 @@ class SwarmBraxEnv(_base.Env):
         )
 
 
-@contextlib.contextmanager
-def mended_jax() -> Iterator[None]:
-    """Restores `device_put_replicated` to JAX in a `with` block, if JAX lacks it.
+def mended_jax() -> AbstractContextManager:
+    """Gives JAX back `device_put_replicated` in a `with` block.
 
     Brax 0.14.2 calls this function, but JAX 0.10 has removed it. The function put one copy of an
     array on each device, stacked along a new axis.
@@ -116,11 +114,4 @@ def mended_jax() -> Iterator[None]:
         copy = jax.pmap(lambda _, one: one, axis_name="i", in_axes=(0, None), devices=devices)
         return copy(np.arange(len(devices)), tree)
 
-    missing = not hasattr(jax, _DROPPED)
-    if missing:
-        setattr(jax, _DROPPED, replicate)
-    try:
-        yield
-    finally:
-        if missing:
-            delattr(jax, _DROPPED)
+    return mock.patch.object(jax, "device_put_replicated", replicate, create=True)

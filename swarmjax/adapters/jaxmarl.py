@@ -72,8 +72,7 @@ class SwarmMultiAgentEnv(_base):
           `__all__` is done, the observations belong to the next episode.
 
         Raises:
-          ValueError: if an action is missing or has a wrong shape.
-          TypeError: if an action has a wrong dtype.
+          ValueError: if an action is missing, or has a wrong shape or dtype.
         """
         _, state, rewards, dones, info = self.step_env(key, state, actions)
         if reset_state is not None:

@@ -4,30 +4,22 @@ import importlib
 from typing import Any
 
 
-def fault(action: Any, shape: tuple[int, ...]) -> str | None:
-    """Describes what is wrong with an action's shape or dtype; None if both are right."""
-    if tuple(action.shape) != shape:
-        return f"action has the shape {tuple(action.shape)}: give {shape}, speed and turn rate."
-    if "float" not in str(action.dtype):
-        return f"action is of dtype {action.dtype}: give float32, -1 to 1."
-    return None
-
-
-def check(action: Any, shape: tuple[int, ...], whose: str = "") -> None:
-    """Checks an action, for libraries without their own errors.
+def check(
+    action: Any, shape: tuple[int, ...], whose: str = "", error: type[Exception] = ValueError
+) -> None:
+    """Refuses an action of a wrong shape or dtype.
 
     Args:
       action: action of one or several robots.
       shape: the expected shape.
-      whose: text at the start of the error message, such as the name of an agent.
-
-    Raises:
-      ValueError: if the action has another shape.
-      TypeError: if the action has a wrong dtype.
+      whose: text at the start of the message, such as the name of an agent.
+      error: the type of the error.
     """
-    if sentence := fault(action, shape):
-        kind = ValueError if tuple(action.shape) != shape else TypeError
-        raise kind(whose + sentence)
+    given = tuple(action.shape)
+    if given != shape:
+        raise error(f"{whose}action has the shape {given}: give {shape}, speed and turn rate.")
+    if "float" not in str(action.dtype):
+        raise error(f"{whose}action is of dtype {action.dtype}: give float32, -1 to 1.")
 
 
 def find(module: str, extra: str, name: str | None = None) -> Any:

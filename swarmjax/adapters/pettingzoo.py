@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import line_up_arena
 from swarmjax.adapters.session import Session, errors, spaces
 from swarmjax.environment import Swarm
@@ -111,7 +111,6 @@ class SwarmParallelEnv(_base):
             raise errors.InvalidAction(f"actions are missing or not expected for {sorted(wrong)}.")
         for agent in self.agents:
             action = np.asarray(actions[agent])
-            if sentence := fault(action, (size,)):
-                raise errors.InvalidAction(f"{agent}: {sentence}")
+            check(action, (size,), f"{agent}: ", errors.InvalidAction)
             stacked[self.possible_agents.index(agent)] = action
         return stacked

@@ -77,8 +77,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
           step.
 
         Raises:
-          ValueError: if the action has a wrong shape.
-          TypeError: if the action has a wrong dtype.
+          ValueError: if the action has a wrong shape or dtype.
         """
         check(action, (self.action_size,))
         late = state.data.arenas.clock[0] + 1 >= self.episode_length

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax.adapters.library import fault, find
+from swarmjax.adapters.library import check, find
 from swarmjax.adapters.robots import RobotRow, RobotStep
 from swarmjax.environment import SwarmState
 
@@ -59,8 +59,8 @@ class Session:
         if self._state is None:
             raise errors.ResetNeeded("step was called before reset: call reset first.")
         action = np.asarray(action)
-        if sentence := fault(action, (len(self._robots), self._robots.action_size)):
-            raise errors.InvalidAction(sentence)
+        shape = (len(self._robots), self._robots.action_size)
+        check(action, shape, error=errors.InvalidAction)
         self._state, came = self._step(self._state, action.astype(np.float32))
         return came
 

@@ -64,8 +64,7 @@ class SwarmTorchEnv:
           The outcome, as tensors.
 
         Raises:
-          ValueError: if the action has a wrong shape, or the environment was never reset.
-          TypeError: if the action has a wrong dtype.
+          ValueError: if the action has a wrong shape or dtype, or the environment was never reset.
         """
         if self._state is None:
             raise ValueError("step was called before reset: call reset first.")

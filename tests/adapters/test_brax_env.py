@@ -59,16 +59,16 @@ def test_nothing_is_learned_from_robots_that_wait(states: list, course: Course) 
 
 
 @pytest.mark.parametrize(
-    ("action", "error", "sentence"),
+    ("action", "sentence"),
     [
-        (jnp.zeros((5, 2)), ValueError, r"^action has the shape \(5, 2\): give \(6, 2\)"),
-        (jnp.zeros((6, 2), int), TypeError, r"^action is of dtype int32: give float32"),
+        (jnp.zeros((5, 2)), r"^action has the shape \(5, 2\): give \(6, 2\)"),
+        (jnp.zeros((6, 2), int), r"^action is of dtype int32: give float32"),
     ],
 )
 def test_wrong_actions_are_refused(
-    env: SwarmBraxEnv, states: list, action: Any, error: type[Exception], sentence: str
+    env: SwarmBraxEnv, states: list, action: Any, sentence: str
 ) -> None:
-    with pytest.raises(error, match=sentence):
+    with pytest.raises(ValueError, match=sentence):
         env.step(states[0], action)
 
 

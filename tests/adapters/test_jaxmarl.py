@@ -121,16 +121,14 @@ def test_jaxmarls_wrapper_takes_it(env: SwarmMultiAgentEnv) -> None:
 
 
 @pytest.mark.parametrize(
-    ("actions", "error", "sentence"),
+    ("actions", "sentence"),
     [
-        ({"agent_0": jnp.zeros(2)}, ValueError, r"^actions lack \['agent_1'\]: give"),
-        (dict.fromkeys(AGENTS, jnp.zeros(3)), ValueError, r"^agent_0: action has the shape \(3,\)"),
-        (dict.fromkeys(AGENTS, jnp.zeros(2, int)), TypeError, "^agent_0: action is of dtype int32"),
+        ({"agent_0": jnp.zeros(2)}, r"^actions lack \['agent_1'\]: give"),
+        (dict.fromkeys(AGENTS, jnp.zeros(3)), r"^agent_0: action has the shape \(3,\)"),
+        (dict.fromkeys(AGENTS, jnp.zeros(2, int)), "^agent_0: action is of dtype int32"),
     ],
 )
-def test_wrong_actions_are_refused(
-    env: SwarmMultiAgentEnv, actions: dict, error: type[Exception], sentence: str
-) -> None:
+def test_wrong_actions_are_refused(env: SwarmMultiAgentEnv, actions: dict, sentence: str) -> None:
     _, state = env.reset(jax.random.key(0))
-    with pytest.raises(error, match=sentence):
+    with pytest.raises(ValueError, match=sentence):
         env.step(jax.random.key(0), state, actions)

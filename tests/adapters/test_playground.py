@@ -78,11 +78,7 @@ def test_playgrounds_wrapper_ends_episodes_and_draws_new_levels(wrapped: Any) ->
     np.testing.assert_array_equal(state.obs, state.data.observation.reshape(3, -1))
 
 
-@pytest.mark.parametrize(
-    ("action", "error"), [(jnp.zeros(2), ValueError), (jnp.zeros(4, int), TypeError)]
-)
-def test_wrong_actions_are_refused(
-    env: SwarmMjxEnv, states: list, action: Any, error: type[Exception]
-) -> None:
-    with pytest.raises(error, match=r"^action "):
+@pytest.mark.parametrize("action", [jnp.zeros(2), jnp.zeros(4, int)])
+def test_wrong_actions_are_refused(env: SwarmMjxEnv, states: list, action: Any) -> None:
+    with pytest.raises(ValueError, match=r"^action "):
         env.step(states[0], action)

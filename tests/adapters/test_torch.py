@@ -78,7 +78,7 @@ def test_bad_use_is_refused(swarm: Swarm) -> None:
     made.reset(0)
     with pytest.raises(ValueError, match=r"^action has the shape \(5, 2\): give \(6, 2\)"):
         made.step(torch.zeros(5, 2))
-    with pytest.raises(TypeError, match=r"^action is of dtype torch\.int64: give float32"):
+    with pytest.raises(ValueError, match=r"^action is of dtype torch\.int64: give float32"):
         made.step(torch.zeros(6, 2, dtype=torch.int64))
     made.close()
     with pytest.raises(ValueError, match=r"^step was called before reset"):
