@@ -209,7 +209,8 @@ def evaluate_policy(
     from swarmjax.evaluate.trials import Entrant
 
     word = extension.hand_over(extensions)
-    several = [policy] if _is_one(policy) else list(policy)
+    # A policy is itself a tuple, so a tuple need not hold several policies.
+    several = [policy] if isinstance(policy, str | Path | Policy) else list(policy)
     entrants = [
         Entrant(each.digest, each)
         if isinstance(each, Policy)
@@ -251,14 +252,6 @@ def _loggers(given: Any) -> "list[Logger]":
                 "them; on_update takes a function of a row."
             )
     return every
-
-
-def _is_one(policy: Any) -> bool:
-    """Returns whether this is one policy or path, not several.
-
-    A policy is itself a tuple, so a tuple need not hold several policies.
-    """
-    return isinstance(policy, str | Path | Policy)
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:

@@ -61,33 +61,19 @@ def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str],
     found = read_choice(_WHOLE, choice)
     if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
         found = {_WHOLE: found}
-    check_shared(cls, found, choice)
-    return of_file(found, Path(choice).parent if is_path(choice) else Path())
+    return read_shared(cls, found, Path(choice))
 
 
-def of_file(found: Mapping[str, Any], folder: Path) -> tuple[dict[str, str], dict[str, Any]]:
-    """Separates the choices of files that a file makes, by group, from its other settings.
-
-    Args:
-      found: the keys and values of the file.
-      folder: the folder of the file. Relative paths in it are meant from there.
-    """
-    chosen = {
-        key: beside(folder, value)
-        for key, value in found.items()
-        if isinstance(value, str) and choices(key)
-    }
-    return chosen, {key: value for key, value in found.items() if key not in chosen}
-
-
-def check_shared(cls: type[Section], found: Mapping[str, Any], path: str | Path) -> None:
-    """Refuses keys that a file from somebody else must not set.
+def read_shared(
+    cls: type[Section], found: Mapping[str, Any], path: Path
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """Separates the choices of files, by group, from the other settings of a file for a whole run.
 
     Args:
-      cls: the command's dataclass. Its `shared` lists the keys and sections that such a file may
-        set.
+      cls: the command's dataclass. Its `shared` lists the keys and sections that such a file, which
+        may come from somebody else, may set.
       found: the keys and values of the file.
-      path: the file, for messages.
+      path: the file. Relative paths in it are meant from its folder.
 
     Raises:
       ConfigError: if there is another key.
@@ -101,6 +87,12 @@ def check_shared(cls: type[Section], found: Mapping[str, Any], path: str | Path)
                 f"{path}: {key} cannot be set by a file, which may set {', '.join(cls.shared)}: "
                 f"remove it, and give {key} on the command line."
             )
+    chosen = {
+        key: beside(path.parent, value)
+        for key, value in found.items()
+        if isinstance(value, str) and choices(key)
+    }
+    return chosen, {key: value for key, value in found.items() if key not in chosen}
 
 
 def is_path(choice: str) -> bool:

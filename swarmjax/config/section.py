@@ -34,7 +34,7 @@ class Bounds:
 
     low: float = -math.inf
     high: float = math.inf
-    above: float = -math.inf
+    above: float = -math.inf  # the value must exceed it
     below: float = math.inf
     reason: str = ""  # why `high` is the limit, and how to raise it
 
@@ -73,11 +73,9 @@ def about(  # most calls give two or three
     low: float = -math.inf,
     high: float = math.inf,
     *,
-    above: float = -math.inf,
-    below: float = math.inf,
     derived: bool = False,
     stored: bool = True,
-    reason: str = "",
+    **bounds: Any,
 ) -> dict[str, Any]:
     """Returns the metadata of a field.
 
@@ -85,14 +83,12 @@ def about(  # most calls give two or three
       meaning: the meaning of the key, with its unit.
       low: the smallest number that the key accepts.
       high: the largest number that the key accepts.
-      above: a number that the value must exceed.
-      below: a number that the value must stay below.
       derived: whether the chosen files determine the value, so that the command line cannot set it.
       stored: whether `to_dict` keeps the field.
-      reason: why `high` is the limit and how to raise it, for the error message.
+      bounds: further fields of `Bounds`.
     """
-    bounds = Bounds(low, high, above, below, reason)
-    return {"meaning": meaning, "bounds": bounds, "derived": derived, "stored": stored}
+    allowed = Bounds(low, high, **bounds)
+    return {"meaning": meaning, "bounds": allowed, "derived": derived, "stored": stored}
 
 
 @dataclass(frozen=True, kw_only=True)

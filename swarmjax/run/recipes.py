@@ -46,8 +46,7 @@ def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
     """Returns the own words of a recipe, and the choice of the recipe that it extends."""
     found = reading.read_yaml(path)
     base = found.pop("recipe", None)
-    files.check_shared(cls, found, path)
-    choices, values = files.of_file(found, path.parent)
+    choices, values = files.read_shared(cls, found, path)
     words = files.write_words({**choices, **values})
     try:
         files.parse(cls, words)

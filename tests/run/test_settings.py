@@ -453,8 +453,8 @@ def test_help_gives_default_meaning_and_allowed_values():
     assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
     assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
-        "run.chunk=auto updates per call of the compiled program "
-        "(a whole number 1 to 2147483647, all or auto)" in lines
+        "run.chunk=auto updates per call of the compiled program; auto: a second of them "
+        "(a whole number 1 to 2147483647 or auto)" in lines
     )
     assert (
         "sim.impl=auto physics implementation; auto: warp on an NVIDIA GPU (auto, jax or warp)"
