@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from swarmjax import command, words
-from swarmjax.config import ConfigError, Section, about, files
+from swarmjax.config import ConfigError, Section, about, files, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.exit_codes import FAILED
 from swarmjax.run import directory
@@ -59,30 +59,24 @@ def load_digests(settings: VerifyConfig, trained: TrainConfig) -> dict[int, str]
       CheckpointError: if its log is damaged.
     """
     log = Path(settings.run) / directory.SAVED
-    # A checkpoint cannot be reproduced if the run had lowered its learning rates, or used other
-    # random streams or another budget, over which the learning rates fall to 0.
-    same = {"rate_scale": 1.0, "budget": trained.budget, "streams": trained.stream_count}
+    # Learning rates fall to 0 over the budget, and each stream has its own random numbers.
+    own = {"budget": trained.budget, "streams": trained.stream_count}
     try:
-        found = {
+        digests = {
             row["update"]: row["digest"]
             for row in directory.read_rows(log, None)
-            if row["update"] > 0
-            and all(row.get(key, value) == value for key, value in same.items())
+            if row["update"] > 0 and all(row.get(key, own[key]) == own[key] for key in own)
         }
     except (KeyError, TypeError):
         raise CheckpointError(f"{log} is damaged: put the file back.") from None
-    if not found:
-        raise ConfigError(
-            f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
-            "the beginning could reproduce: give a run that has saved a checkpoint after its first "
-            "update, with the budget and random streams of its config.json."
-        )
-    most = settings.updates or min(found)
-    chosen = {update: found[update] for update in sorted(found) if update <= most}
+    most = settings.updates or min(digests, default=0)
+    chosen = {update: digests[update] for update in sorted(digests) if update <= most}
     if not chosen:
         raise ConfigError(
-            f"updates is {most}, but the first checkpoint of {settings.run} is of update "
-            f"{min(found)}: give at least {min(found)}."
+            f"run is {settings.run}, which has no digests in {directory.SAVED} that training from "
+            f"the beginning could reproduce with updates={show(settings.updates)}: give more "
+            "updates, or a run that has saved a checkpoint with the budget and random streams of "
+            "its config.json."
         )
     return chosen
 

@@ -398,13 +398,13 @@ def test_a_run_that_was_trained_otherwise_does_not_verify(
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (None, "has no digests in checkpoints.jsonl .* give a run that has saved a checkpoint"),
+        (None, "has no digests in checkpoints.jsonl .* a run that has saved a checkpoint"),
         ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
         (
-            '{"update": 2, "digest": "a", "rate_scale": 0.1}\n',
+            '{"update": 2, "digest": "a", "budget": 7}\n',
             "has no digests in checkpoints.jsonl",
         ),
-        ('{"update": 7, "digest": "a"}\n', "the first checkpoint of .* give at least 7"),
+        ('{"update": 7, "digest": "a"}\n', "with updates=3: give more updates"),
         ("{\n", "checkpoints.jsonl is damaged at line 1"),
     ],
 )
