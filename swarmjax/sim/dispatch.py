@@ -174,9 +174,9 @@ def load_engine(
         solve = _push_apart(choice.impl, rubs=discs.rubs(model))
         found = discs.load_engine(model, ids, robot.hull_radius, solve)
     else:
-        from swarmjax.sim.fast import warp_step  # needs Warp
+        from swarmjax.sim.fast import wheeled_warp  # needs Warp
 
-        found = warp_step.load_engine(model, robots, arenas)
+        found = wheeled_warp.load_engine(model, robots, arenas)
     return replace(found, impl=choice.impl, solver=choice.solver)
 
 

@@ -143,16 +143,12 @@ def _most_rows(m: Any, robots: int) -> int:
 
 def make_room(m: Any, d: Any, robots: int) -> Any:
     """Allocates the work arrays for robots that touch each other."""
-    arenas, together = d.nworld, Together()
+    arenas, rows, together = d.nworld, (d.nworld, d.njmax), Together()
     together.crowded = wp.empty(1, dtype=int)
-    together.arena = wp.empty(arenas, dtype=int)
-    together.count = wp.empty(arenas, dtype=int)
-    together.row = wp.empty((arenas, d.njmax), dtype=int)
+    together.arena, together.count, together.taken = (wp.empty(arenas, dtype=int) for _ in range(3))
+    together.row, together.slot = wp.empty(rows, dtype=int), wp.empty(rows, dtype=int)
+    together.gap, together.slope = wp.empty(rows, dtype=float), wp.empty(rows, dtype=float)
     together.step = wp.empty((arenas, m.nv), dtype=float)
-    together.gap = wp.empty((arenas, d.njmax), dtype=float)
-    together.slope = wp.empty((arenas, d.njmax), dtype=float)
-    together.slot = wp.empty((arenas, d.njmax), dtype=int)
-    together.taken = wp.empty(arenas, dtype=int)
     together.pair = wp.empty((arenas, PAIRS), dtype=int)
     together.factor = wp.empty((arenas, robots), dtype=Matrix)
     together.response = wp.empty((arenas, PAIRS, 2), dtype=Vector)
