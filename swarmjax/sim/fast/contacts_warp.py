@@ -50,12 +50,19 @@ def launch(
     Returns:
       [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
-    many = of_arenas(functools.partial(_launch, kernel, rows, discs))
-    return many(*jax.tree.map(lambda x: x[None], (robots, side, obstacle)))[0]
+    return over_arenas(functools.partial(_launch, kernel, rows, discs), robots, side, obstacle)
 
 
-def of_arenas(solve: Any) -> Any:
-    """Makes a function of arrays with an arena axis treat each `vmap` axis as more arenas."""
+def over_arenas(solve: Any, *inputs: Any) -> Array:
+    """Calls a function of many arenas for one arena; each `vmap` axis becomes more arenas.
+
+    Args:
+      solve: takes the inputs with a leading arena axis, and returns an array with that axis.
+      *inputs: arrays of one arena, or trees of them.
+
+    Returns:
+      The result for the arena.
+    """
     many = custom_vmap(solve)
 
     @many.def_vmap
@@ -69,7 +76,7 @@ def of_arenas(solve: Any) -> Any:
         result = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
         return result.reshape(*shape, *result.shape[1:]), True
 
-    return many
+    return many(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))[0]
 
 
 def _launch(

@@ -154,20 +154,6 @@ def rubs(model: mujoco.MjModel) -> bool:
     return bool((model.pair_dim > 1).any())
 
 
-def put(model: mujoco.MjModel) -> tuple[Model, Data]:
-    """Copies to the device the fields that a step reads.
-
-    Args:
-      model: compiled, one arena.
-
-    Returns:
-      The model, and an arena of zeros to fill in.
-    """
-    fields = model.body_mass, model.body_inertia, model.body_invweight0
-    still = jnp.zeros(model.nv)
-    return Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
-
-
 def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Engine:
     """Creates the engine for discs.
 
@@ -186,7 +172,9 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
         "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
-    return Engine(label, *put(model), functools.partial(step, discs), is_mjx=False)
+    fields, still = (getattr(model, name) for name in Model.__annotations__), jnp.zeros(model.nv)
+    placed, data = Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
+    return Engine(label, placed, data, functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import warp as wp
 from jax import Array
 
-from swarmjax.sim.fast.contacts_warp import of_arenas
+from swarmjax.sim.fast.contacts_warp import over_arenas
 
 _FAR = wp.constant(1e30)  # m; stands for inf inside the kernels
 _OPEN, _SETTLED = wp.constant(0), wp.constant(1)
@@ -79,8 +79,7 @@ def measure(
 
 def _run(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
     """Runs a kernel for one arena; returns its last output."""
-    many = of_arenas(partial(_launch, kernel, threads, shapes, widened))
-    return many(*(jnp.asarray(each)[None] for each in inputs))[0]
+    return over_arenas(partial(_launch, kernel, threads, shapes, widened), *inputs)
 
 
 def _launch(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
