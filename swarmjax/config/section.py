@@ -1,6 +1,6 @@
 """Sections of settings: strict conversion, bounds, and one-sentence errors.
 
-A section is a frozen dataclass. Each field carries its meaning and bounds as `about` metadata.
+A section is a frozen dataclass. Each field carries its meaning and bounds as metadata (`setting`).
 `build` makes a section from plain data, and `to_dict` converts it back. This module does not know
 what the settings are for.
 """
@@ -11,7 +11,7 @@ import math
 import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 from swarmjax.config import values
@@ -89,6 +89,11 @@ def about(  # most calls give two or three
     """
     allowed = Bounds(low, high, **bounds)
     return {"meaning": meaning, "bounds": allowed, "derived": derived, "stored": stored}
+
+
+def setting(default: Any, meaning: str, *limits: float, **more: Any) -> Any:
+    """Returns a field with a default; all other arguments are those of `about`."""
+    return field(default=default, metadata=about(meaning, *limits, **more))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,10 @@
 """Settings of the robot and of the compiled simulation."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 
 # m; a level leaves passages of 0.10 m (task/stage_config.py). A robot of this radius fits through
 # with a tenth of the passage to spare.
@@ -35,80 +35,66 @@ HULL_FRICTION_REASON = "rubber on rubber has less than 2, and plastic has less t
 class RobotConfig(Section):
     """The robot; the default values are the e-puck's, with their sources in epuck.py."""
 
-    body: Literal["planar", "wheeled"] = field(
-        default="planar",
-        metadata=about("planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"),
+    body: Literal["planar", "wheeled"] = setting(
+        "planar", "planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"
     )
-    hull_radius: float = field(
-        default=epuck.HULL_RADIUS,
-        metadata=about("radius of the hull, m", above=0.0, high=LARGEST_HULL, reason=_HULL_REASON),
+    hull_radius: float = setting(
+        epuck.HULL_RADIUS,
+        "radius of the hull, m",
+        above=0.0,
+        high=LARGEST_HULL,
+        reason=_HULL_REASON,
     )
-    mass: float = field(
-        default=epuck.MASS,
-        metadata=about("mass including wheels, kg", above=2 * epuck.WHEEL_MASS, high=100.0),
+    mass: float = setting(
+        epuck.MASS, "mass including wheels, kg", above=2 * epuck.WHEEL_MASS, high=100.0
     )
-    yaw_inertia: float = field(
-        default=epuck.YAW_INERTIA,
-        metadata=about("moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0),
+    yaw_inertia: float = setting(
+        epuck.YAW_INERTIA, "moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0
     )
-    wheel_radius: float = field(
-        default=epuck.WHEEL_RADIUS,
-        metadata=about("radius of the wheels, m", LEAST, LARGEST_HULL),
+    wheel_radius: float = setting(
+        epuck.WHEEL_RADIUS, "radius of the wheels, m", LEAST, LARGEST_HULL
     )
-    track: float = field(
-        default=epuck.TRACK,
-        metadata=about(
-            "distance between the wheels for converting commands to wheel speeds, m",
-            LEAST,
-            2 * LARGEST_HULL,
-        ),
+    track: float = setting(
+        epuck.TRACK,
+        "distance between the wheels for converting commands to wheel speeds, m",
+        LEAST,
+        2 * LARGEST_HULL,
     )
-    effective_track: float | None = field(
-        default=None,
-        metadata=about(
-            "distance between the points where the wheels grip, m; null: track",
-            LEAST,
-            2 * LARGEST_HULL,
-        ),
+    effective_track: float | None = setting(
+        None,
+        "distance between the points where the wheels grip, m; null: track",
+        LEAST,
+        2 * LARGEST_HULL,
     )
-    motor_lag: float = field(
-        default=0.0,
-        metadata=about("time constant of the wheel servos, s; 0: one physics step", 0.0, 1.0),
+    motor_lag: float = setting(
+        0.0, "time constant of the wheel servos, s; 0: one physics step", 0.0, 1.0
     )
-    max_wheel_speed: float = field(
-        default=epuck.MAX_WHEEL_SPEED,
-        metadata=about("speed limit of each wheel, rad/s", LEAST, FASTEST_WHEEL),
+    max_wheel_speed: float = setting(
+        epuck.MAX_WHEEL_SPEED, "speed limit of each wheel, rad/s", LEAST, FASTEST_WHEEL
     )
-    friction: float = field(
-        default=epuck.FRICTION,
-        metadata=about("friction of wheels on floor", LEAST, MOST_FRICTION, reason=FRICTION_REASON),
+    friction: float = setting(
+        epuck.FRICTION, "friction of wheels on floor", LEAST, MOST_FRICTION, reason=FRICTION_REASON
     )
-    hull_friction: float = field(
-        default=0.0,
-        metadata=about(
-            "friction of hulls on hulls, boxes and walls; 0: they slide; Webots has 1",
-            0.0,
-            MOST_HULL_FRICTION,
-            reason=HULL_FRICTION_REASON,
-        ),
+    hull_friction: float = setting(
+        0.0,
+        "friction of hulls on hulls, boxes and walls; 0: they slide; Webots has 1",
+        0.0,
+        MOST_HULL_FRICTION,
+        reason=HULL_FRICTION_REASON,
     )
-    max_speed: float = field(
-        default=epuck.MAX_SPEED,
-        metadata=about(
-            "upper limit of the speed command, m/s; the lower limit is 0",
-            LEAST,
-            _FASTEST,
-            reason=_SPEED_REASON,
-        ),
+    max_speed: float = setting(
+        epuck.MAX_SPEED,
+        "upper limit of the speed command, m/s; the lower limit is 0",
+        LEAST,
+        _FASTEST,
+        reason=_SPEED_REASON,
     )
-    max_turn_rate: float = field(
-        default=epuck.MAX_TURN_RATE,
-        metadata=about(
-            "limit of the turn command in both directions, rad/s",
-            LEAST,
-            _FASTEST_TURN,
-            reason=_TURN_REASON,
-        ),
+    max_turn_rate: float = setting(
+        epuck.MAX_TURN_RATE,
+        "limit of the turn command in both directions, rad/s",
+        LEAST,
+        _FASTEST_TURN,
+        reason=_TURN_REASON,
     )
 
     @property
@@ -146,27 +132,22 @@ class RobotConfig(Section):
 class SimConfig(Section):
     """Settings of the compiled simulation."""
 
-    impl: Literal["auto", "jax", "warp"] = field(
-        default="auto", metadata=about("physics implementation; auto: warp on an NVIDIA GPU")
+    impl: Literal["auto", "jax", "warp"] = setting(
+        "auto", "physics implementation; auto: warp on an NVIDIA GPU"
     )
-    solver: Literal["auto", "mjx", "swarm"] = field(
-        default="auto",
-        metadata=about(
-            "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
-            "body, on wheels only with impl=warp; auto: swarm where available",
-        ),
+    solver: Literal["auto", "mjx", "swarm"] = setting(
+        "auto",
+        "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
+        "body, on wheels only with impl=warp; auto: swarm where available",
     )
-    max_robots: int | None = field(
-        default=None,
-        metadata=about("robots to compile for; null: 5, or as many as the stages need", 1, 100),
+    max_robots: int | None = setting(
+        None, "robots to compile for; null: 5, or as many as the stages need", 1, 100
     )
-    max_obstacles: int | None = field(
-        default=None,
-        metadata=about("obstacles to compile for; null: 4, or as many as the stages need", 0, 64),
+    max_obstacles: int | None = setting(
+        None, "obstacles to compile for; null: 4, or as many as the stages need", 0, 64
     )
-    substeps: int | None = field(
-        default=None,
-        metadata=about("physics steps per control step; null: the body's default", 1, 1000),
+    substeps: int | None = setting(
+        None, "physics steps per control step; null: the body's default", 1, 1000
     )
 
     @property

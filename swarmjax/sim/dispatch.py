@@ -85,25 +85,23 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
     Raises:
       ConfigError: `swarm` is selected but not available for this combination.
     """
-    if solver == "swarm" and body == "wheeled" and impl != "warp":
-        raise ConfigError(
-            f"sim.solver is swarm, but robot.body is wheeled and sim.impl is {impl}: give mjx "
-            "or auto, or sim.impl=warp."
-        )
-    if solver == "swarm" and body == "wheeled" and robots > MOST_WHEELED:
-        raise ConfigError(
-            f"sim.solver is swarm, but robot.body is wheeled and sim.max_robots is {robots}: give "
-            f"mjx or auto, or {MOST_WHEELED} robots at most."
-        )
-    if solver == "swarm" and body == "wheeled" and rubs:
-        raise ConfigError(
-            "sim.solver is swarm, but robot.body is wheeled and its hulls have friction "
-            "(robot.hull_friction): give mjx or auto, or leave it out."
-        )
+    reasons = [
+        (impl != "warp", f"sim.impl is {impl}: give mjx or auto, or sim.impl=warp."),
+        (
+            robots > MOST_WHEELED,
+            f"sim.max_robots is {robots}: give mjx or auto, or {MOST_WHEELED} robots at most.",
+        ),
+        (
+            rubs,
+            "its hulls have friction (robot.hull_friction): give mjx or auto, or leave it out.",
+        ),
+    ]
+    missing = [reason for holds, reason in reasons if holds and body == "wheeled"]
+    if solver == "swarm" and missing:
+        raise ConfigError(f"sim.solver is swarm, but robot.body is wheeled and {missing[0]}")
     if solver != "auto":
         return solver
-    possible = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED and not rubs)
-    return "swarm" if possible else "mjx"
+    return "mjx" if missing else "swarm"
 
 
 class EngineChoice(NamedTuple):
@@ -174,9 +172,9 @@ def load_engine(
         solve = _push_apart(choice.impl, rubs=discs.rubs(model))
         found = discs.load_engine(model, ids, robot.hull_radius, solve)
     else:
-        from swarmjax.sim.fast import warp_step  # needs Warp
+        from swarmjax.sim.fast import wheeled_warp  # needs Warp
 
-        found = warp_step.load_engine(model, robots, arenas)
+        found = wheeled_warp.load_engine(model, robots, arenas)
     return replace(found, impl=choice.impl, solver=choice.solver)
 
 

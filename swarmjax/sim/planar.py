@@ -171,7 +171,7 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Changes mass and inertia, hull friction, and the servos if they are actuators."""
+    """Changes mass and inertia, and the servos if they are actuators."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)

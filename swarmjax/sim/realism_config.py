@@ -1,11 +1,11 @@
 """Settings of the sensor models, and of differences between robots and between steps."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim.config import (
     FASTEST_WHEEL,
     FRICTION_REASON,
@@ -37,141 +37,110 @@ class RealismConfig(Section):
     sources.
     """
 
-    name: Literal["ideal", "webots", "real"] = field(
-        default="ideal",
-        metadata=about("preset that the settings are based on", derived=True),
+    name: Literal["ideal", "webots", "real"] = setting(
+        "ideal", "preset that the settings are based on", derived=True
     )
-    infrared: Literal["ideal", "webots", "real"] = field(
-        default="ideal",
-        metadata=about("sensor model: exact distance, Webots' table, or fitted to real robots"),
+    infrared: Literal["ideal", "webots", "real"] = setting(
+        "ideal", "sensor model: exact distance, Webots' table, or fitted to real robots"
     )
-    infrared_noise: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("factor on the model's own noise; per sensor and episode", 0.0, 1000.0),
+    infrared_noise: tuple[float, float] | None = setting(
+        None, "factor on the model's own noise; per sensor and episode", 0.0, 1000.0
     )
-    infrared_gain: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("factor on reflected counts; per sensor and episode", above=0.0, high=10.0),
+    infrared_gain: tuple[float, float] | None = setting(
+        None, "factor on reflected counts; per sensor and episode", above=0.0, high=10.0
     )
-    infrared_offset: float | None = field(
-        default=None,
-        metadata=about("SD of counts left after zeroing; per sensor and episode", 0.0, 4095.0),
+    infrared_offset: float | None = setting(
+        None, "SD of counts left after zeroing; per sensor and episode", 0.0, 4095.0
     )
-    infrared_yaw: float | None = field(
-        default=None, metadata=about("SD of the yaw, rad; per sensor and episode", 0.0, math.pi)
+    infrared_yaw: float | None = setting(
+        None, "SD of the yaw, rad; per sensor and episode", 0.0, math.pi
     )
-    infrared_position: float | None = field(
-        default=None,
-        metadata=about("SD of the position on each axis, m; per sensor and episode", 0.0, 0.01),
+    infrared_position: float | None = setting(
+        None, "SD of the position on each axis, m; per sensor and episode", 0.0, 0.01
     )
-    infrared_period: tuple[float, float] | None = field(
-        default=None,
-        metadata=about(
-            "time between samples, s; per robot and episode; null: every control step",
-            above=0.0,
-            high=_LONGEST,
-        ),
+    infrared_period: tuple[float, float] | None = setting(
+        None,
+        "time between samples, s; per robot and episode; null: every control step",
+        above=0.0,
+        high=_LONGEST,
     )
-    reflectance_wall: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("reflectance of all walls; per episode; null: 1", above=0.0, high=1.0),
+    reflectance_wall: tuple[float, float] | None = setting(
+        None, "reflectance of all walls; per episode; null: 1", above=0.0, high=1.0
     )
-    reflectance_obstacle: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("reflectance of each obstacle; per episode; null: 1", above=0.0, high=1.0),
+    reflectance_obstacle: tuple[float, float] | None = setting(
+        None, "reflectance of each obstacle; per episode; null: 1", above=0.0, high=1.0
     )
-    reflectance_robot: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("reflectance of each robot; per episode; null: 1", above=0.0, high=1.0),
+    reflectance_robot: tuple[float, float] | None = setting(
+        None, "reflectance of each robot; per episode; null: 1", above=0.0, high=1.0
     )
-    dead_sensor: float | None = field(
-        default=None,
-        metadata=about("probability of a dead sensor; per sensor and episode", 0.0, 1.0),
+    dead_sensor: float | None = setting(
+        None, "probability of a dead sensor; per sensor and episode", 0.0, 1.0
     )
-    wheel_radius: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("radius of the wheels, m; per robot and episode", LEAST, below=0.03),
+    wheel_radius: tuple[float, float] | None = setting(
+        None, "radius of the wheels, m; per robot and episode", LEAST, below=0.03
     )
-    wheel_mismatch: float | None = field(
-        default=None,
-        metadata=about(
-            "SD of the relative difference in radius, right - left; per robot and episode", 0.0, 0.1
-        ),
+    wheel_mismatch: float | None = setting(
+        None,
+        "SD of the relative difference in radius, right - left; per robot and episode",
+        0.0,
+        0.1,
     )
-    track: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL),
+    track: tuple[float, float] | None = setting(
+        None, "effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
     )
-    max_wheel_speed: tuple[float, float] | None = field(
-        default=None,
-        metadata=about(
-            "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL
-        ),
+    max_wheel_speed: tuple[float, float] | None = setting(
+        None, "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL
     )
-    mass: tuple[float, float] | None = field(
-        default=None,
-        metadata=about("mass, kg; per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0),
+    mass: tuple[float, float] | None = setting(
+        None, "mass, kg; per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0
     )
-    friction: tuple[float, float] | None = field(
-        default=None,
-        metadata=about(
-            "friction of wheels on floor; per robot and episode",
-            LEAST,
-            MOST_FRICTION,
-            reason=FRICTION_REASON,
-        ),
+    friction: tuple[float, float] | None = setting(
+        None,
+        "friction of wheels on floor; per robot and episode",
+        LEAST,
+        MOST_FRICTION,
+        reason=FRICTION_REASON,
     )
-    speed_noise: float | None = field(
-        default=None,
-        metadata=about("relative SD of the wheel speed; per wheel and control step", 0.0, 1.0),
+    speed_noise: float | None = setting(
+        None, "relative SD of the wheel speed; per wheel and control step", 0.0, 1.0
     )
-    speed_quantisation: Literal["epuck1", "epuck2"] | None = field(
-        default=None, metadata=about("rounds wheel speeds to those that this firmware can set")
+    speed_quantisation: Literal["epuck1", "epuck2"] | None = setting(
+        None, "rounds wheel speeds to those that this firmware can set"
     )
-    action_latency: tuple[int, int] | None = field(
-        default=None,
-        metadata=about(
-            "latency of commands, control steps; per robot and episode",
-            0,
-            _MOST_LATENCY,
-            reason=_LATENCY_REASON,
-        ),
+    action_latency: tuple[int, int] | None = setting(
+        None,
+        "latency of commands, control steps; per robot and episode",
+        0,
+        _MOST_LATENCY,
+        reason=_LATENCY_REASON,
     )
-    stall: float | None = field(
-        default=None,
-        metadata=about("probability that commands stop arriving; per control step", 0.0, 1.0),
+    stall: float | None = setting(
+        None, "probability that commands stop arriving; per control step", 0.0, 1.0
     )
-    stall_time: tuple[float, float] = field(
-        default=(0.1, 0.3), metadata=about("duration, s; per stall", above=0.0, high=_LONGEST)
+    stall_time: tuple[float, float] = setting(
+        (0.1, 0.3), "duration, s; per stall", above=0.0, high=_LONGEST
     )
-    observation_latency: tuple[int, int] | None = field(
-        default=None,
-        metadata=about(
-            "latency of observations, control steps; per robot and episode",
-            0,
-            _MOST_LATENCY,
-            reason=_LATENCY_REASON,
-        ),
+    observation_latency: tuple[int, int] | None = setting(
+        None,
+        "latency of observations, control steps; per robot and episode",
+        0,
+        _MOST_LATENCY,
+        reason=_LATENCY_REASON,
     )
-    target_distance_noise: float | None = field(
-        default=None, metadata=about("SD of the distance, m; per robot and control step", 0.0, 10.0)
+    target_distance_noise: float | None = setting(
+        None, "SD of the distance, m; per robot and control step", 0.0, 10.0
     )
-    target_bearing_noise: float | None = field(
-        default=None,
-        metadata=about("SD of the bearing, rad; per robot and control step", 0.0, math.pi),
+    target_bearing_noise: float | None = setting(
+        None, "SD of the bearing, rad; per robot and control step", 0.0, math.pi
     )
-    packet_loss: float | None = field(
-        default=None,
-        metadata=about(
-            "probability that a robot misses a neighbour; per pair and control step", 0.0, 1.0
-        ),
+    packet_loss: float | None = setting(
+        None, "probability that a robot misses a neighbour; per pair and control step", 0.0, 1.0
     )
-    neighbour_distance_noise: float | None = field(
-        default=None, metadata=about("SD of the distance, m; per pair and control step", 0.0, 10.0)
+    neighbour_distance_noise: float | None = setting(
+        None, "SD of the distance, m; per pair and control step", 0.0, 10.0
     )
-    neighbour_bearing_noise: float | None = field(
-        default=None,
-        metadata=about("SD of the bearing, rad; per pair and control step", 0.0, math.pi),
+    neighbour_bearing_noise: float | None = setting(
+        None, "SD of the bearing, rad; per pair and control step", 0.0, math.pi
     )
 
     def _check(self) -> None:

@@ -137,7 +137,7 @@ def survey(level: Level, hull_radius: float, fast: Any = None) -> Roadmap:
     if fast is not None and len(corner):
         widened, frame = _WIDENED * hull_radius, _frames(level)
         legs = fast.find_legs(corner, level.side, frame, widened)
-        to_go = fast.settle(level.target, level.side, corner, frame, legs, widened)
+        to_go = fast.settle(level.target, corner, frame, legs, widened)
         return Roadmap(corner, to_go)
     corners, targets = _locate(corner, level), _locate(level.target, level)
     usable = jnp.all(jnp.abs(corner) <= 0.5 * level.side - _WIDENED * hull_radius, axis=-1)
@@ -175,7 +175,7 @@ def measure(
     """
     if fast is not None and len(roadmap.corner):
         known = level.target, roadmap.corner, roadmap.to_go, _frames(level)
-        return fast.measure(place, level.side, *known, _WIDENED * hull_radius)
+        return fast.measure(place, *known, _WIDENED * hull_radius)
     here, targets = _locate(place, level), _locate(level.target, level)
     barred = _is_barred(here, targets, level, _WIDENED * hull_radius)
     direct = jnp.where(barred, jnp.inf, jnp.hypot(*(level.target - place).T))

@@ -53,6 +53,7 @@ class Discs(NamedTuple):
         own index.
       solref: time constant (s) and damping ratio of all contacts.
       solimp: impedance of all contacts: smallest, largest, width (m), midpoint, power.
+      friction: friction between hulls and everything that they touch; 0 for none.
       solve: `push_apart` of a solver. It takes these constants, the robots of an arena, its side []
         (m) and obstacles [M, 5] (x, y, yaw, half edges), and returns the accelerations including
         contacts.
@@ -65,6 +66,7 @@ class Discs(NamedTuple):
     opponent: np.ndarray
     solref: np.ndarray
     solimp: np.ndarray
+    friction: np.float32
     solve: "Solve"
 
 
@@ -76,14 +78,11 @@ class Model:
       body_mass: [B] kg.
       body_inertia: [B, 3] kg m^2.
       body_invweight0: [B, 2] 1 / kg, 1 / (kg m^2).
-      pair_friction: [P, 5] friction, the same for all pairs; the first two numbers are along the
-        face. None for hulls without friction.
     """
 
     body_mass: Array
     body_inertia: Array
     body_invweight0: Array
-    pair_friction: Array | None = None
 
 
 @struct.dataclass
@@ -103,18 +102,6 @@ class Data:
     qfrc_applied: Array
 
 
-class Rubbing(NamedTuple):
-    """Additional quantities for friction in an arena, or in many arenas with a leading axis.
-
-    Attributes:
-      agility: [R] 1 / moment of inertia, 1 / (kg m^2).
-      friction: [] friction between hulls and everything that they touch.
-    """
-
-    agility: Array
-    friction: Array
-
-
 class DiscRobots(NamedTuple):
     """The robots of an arena, or of many arenas with a leading axis.
 
@@ -125,7 +112,7 @@ class DiscRobots(NamedTuple):
       before: [R, 3] acceleration of `place` in the previous step, 1/s^2.
       mobility: [R] 1 / mass, 1 / kg.
       weight: [R] MuJoCo's inverse weight, 1 / kg.
-      rubbing: quantities for friction; None for hulls without friction.
+      agility: [R] 1 / moment of inertia, 1 / (kg m^2); only friction reads it.
     """
 
     place: Array
@@ -134,7 +121,7 @@ class DiscRobots(NamedTuple):
     before: Array
     mobility: Array
     weight: Array
-    rubbing: Rubbing | None = None
+    agility: Array
 
 
 Solve = Callable[[Discs, DiscRobots, Array, Array], Array]
@@ -158,28 +145,13 @@ def load(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve)
     rounds = _rounds(len(ids.hull_body))
     of_model = model.opt.timestep, model.opt.iterations, ids.hull_body
     assert model.opt.impratio == 1.0  # contacts are as soft along the face as along the normal
-    return Discs(radius, *of_model, rounds, solref[0], solimp[0], solve)
+    friction = np.float32(model.pair_friction[0, 0] if rubs(model) else 0.0)
+    return Discs(radius, *of_model, rounds, solref[0], solimp[0], friction, solve)
 
 
 def rubs(model: mujoco.MjModel) -> bool:
     """Returns whether the model's hulls have friction."""
     return bool((model.pair_dim > 1).any())
-
-
-def put(model: mujoco.MjModel) -> tuple[Model, Data]:
-    """Copies to the device the fields that a step reads.
-
-    Args:
-      model: compiled, one arena.
-
-    Returns:
-      The model, and an arena of zeros to fill in.
-    """
-    fields = model.body_mass, model.body_inertia, model.body_invweight0
-    still = jnp.zeros(model.nv)
-    friction = jnp.asarray(model.pair_friction) if rubs(model) else None
-    placed = Model(*map(jnp.asarray, fields), pair_friction=friction)
-    return placed, Data(jnp.zeros(model.nq), still, still, still)
 
 
 def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve: Solve) -> Engine:
@@ -200,7 +172,9 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
         "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
-    return Engine(label, *put(model), functools.partial(step, discs), is_mjx=False)
+    fields, still = (getattr(model, name) for name in Model.__annotations__), jnp.zeros(model.nv)
+    placed, data = Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
+    return Engine(label, placed, data, functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:
@@ -250,10 +224,8 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
     fields = data.qpos, data.qvel, data.qfrc_applied, data.qacc_warmstart
     place, rate, force, before = (field.reshape(-1, 3) for field in fields)
     free = force / jnp.stack([mass, mass, turn], axis=-1)
-    robots = DiscRobots(place, rate, free, before, 1.0 / mass, model.body_invweight0[discs.body, 0])
-    if model.pair_friction is None:
-        return robots
-    return robots._replace(rubbing=Rubbing(1.0 / turn, model.pair_friction[0, 0]))
+    weight = model.body_invweight0[discs.body, 0]
+    return DiscRobots(place, rate, free, before, 1.0 / mass, weight, 1.0 / turn)
 
 
 def spring(discs: Discs) -> tuple[float, float]:

@@ -8,12 +8,13 @@ minutes to compile the JAX code.
 """
 
 from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import warp as wp
 from jax import Array
 
-from swarmjax.sim.fast.planar_warp import of_arenas
+from swarmjax.sim.fast.contacts_warp import over_arenas
 
 _FAR = wp.constant(1e30)  # m; stands for inf inside the kernels
 _OPEN, _SETTLED = wp.constant(0), wp.constant(1)
@@ -34,18 +35,15 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
       [K, K] m; inf if an obstacle is in between, or if a corner lies in an obstacle or outside the
       arena. The distance from a corner to itself is 0 m, unless the corner lies outside.
     """
-    many = of_arenas(partial(_find_legs, widened))
-    return many(corner[None], jnp.asarray(side)[None], frame[None])[0]
+    size = len(corner), len(corner)
+    return _run(_leg, size, {"length": size}, widened, corner, side, frame)
 
 
-def settle(
-    target: Array, side: Array, corner: Array, frame: Array, legs: Array, widened: float
-) -> Array:
+def settle(target: Array, corner: Array, frame: Array, legs: Array, widened: float) -> Array:
     """Finds the distance from each corner to each target.
 
     Args:
       target: [R, 2] x and y, m.
-      side: [] side of the arena, m.
       corner: [K, 2] x and y, m.
       frame: [M, 6] obstacles, as for `find_legs`.
       legs: [K, K] result of `find_legs`.
@@ -54,25 +52,18 @@ def settle(
     Returns:
       [R, K] m; inf without a path.
     """
-    many = of_arenas(partial(_settle, widened))
-    given = (target, jnp.asarray(side), corner, frame, legs)
-    return many(*(each[None] for each in given))[0]
+    size = len(target), len(corner)
+    shapes = {"state": size, "to_go": size}
+    return _run(_settle_corners, size[:1], shapes, widened, target, corner, frame, legs)
 
 
 def measure(
-    place: Array,
-    side: Array,
-    target: Array,
-    corner: Array,
-    to_go: Array,
-    frame: Array,
-    widened: float,
+    place: Array, target: Array, corner: Array, to_go: Array, frame: Array, widened: float
 ) -> Array:
     """Measures the shortest paths.
 
     Args:
       place: [R, 2] places of the robots: x and y, m.
-      side: [] side of the arena, m.
       target: [R, 2] x and y, m.
       corner: [K, 2] x and y, m.
       to_go: [R, K] distance from each corner to each target, m.
@@ -82,43 +73,22 @@ def measure(
     Returns:
       [R] m; inf without a path.
     """
-    many = of_arenas(partial(_measure, widened))
-    given = (place, jnp.asarray(side), target, corner, to_go, frame)
-    return many(*(each[None] for each in given))[0]
+    size = (len(place),)
+    return _run(_path, size, {"length": size}, widened, place, target, corner, to_go, frame)
 
 
-def _find_legs(widened: float, corner: Array, side: Array, frame: Array) -> Array:
-    """Measures the straight lines [A, K, K] of many arenas."""
-    arenas, corners = corner.shape[:2]
-    call = wp.jax_kernel(_leg, num_outputs=1)
-    size = (arenas, corners, corners)
-    return _from_far(call(corner, side, frame, widened, launch_dims=size, output_dims=size)[0])
+def _run(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
+    """Runs a kernel for one arena; returns its last output."""
+    return over_arenas(partial(_launch, kernel, threads, shapes, widened), *inputs)
 
 
-def _settle(widened: float, target: Array, side: Array, *given: Array) -> Array:
-    """Finds the distances [A, R, K] of many arenas."""
-    arenas, robots = target.shape[:2]
-    corner, frame, legs = given
-    size = (arenas, robots, corner.shape[1])
-    call = wp.jax_kernel(_settle_corners, num_outputs=2)
-    del side  # unused; `of_arenas` takes the number of arenas from its shape
-    shapes = {"state": size, "to_go": size}
-    found = call(
-        target, corner, frame, legs, widened, launch_dims=(arenas, robots), output_dims=shapes
-    )
-    return _from_far(found[1])
-
-
-def _measure(widened: float, place: Array, side: Array, *given: Array) -> Array:
-    """Measures the shortest paths [A, R] of many arenas."""
-    size = place.shape[:2]
-    del side
-    call = wp.jax_kernel(_path, num_outputs=1)
-    return _from_far(call(place, *given, widened, launch_dims=size, output_dims=size)[0])
-
-
-def _from_far(found: Array) -> Array:
-    return jnp.where(found >= 0.5e30, jnp.inf, found)
+def _launch(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
+    """Runs a kernel for many arenas, with these threads and shapes of outputs for each."""
+    arenas = len(inputs[0])
+    call = wp.jax_kernel(kernel, num_outputs=len(shapes))
+    sizes = {name: (arenas, *shape) for name, shape in shapes.items()}
+    outputs = call(*inputs, widened, launch_dims=(arenas, *threads), output_dims=sizes)
+    return jnp.where(outputs[-1] >= 0.5 * _FAR, jnp.inf, outputs[-1])
 
 
 @wp.func
@@ -154,7 +124,7 @@ def _leg(
     side: wp.array[float],
     frame: wp.array3d[float],
     widened: float,
-    found: wp.array3d[float],
+    length: wp.array3d[float],
 ) -> None:
     """Measures the straight line from one corner to another."""
     arena, i, j = wp.tid()
@@ -162,10 +132,10 @@ def _leg(
     reach = wp.max(
         wp.max(wp.abs(begin[0]), wp.abs(begin[1])), wp.max(wp.abs(end[0]), wp.abs(end[1]))
     )
-    length = float(_FAR)
+    straight = float(_FAR)
     if reach <= 0.5 * side[arena] - widened and not _is_barred(frame, arena, widened, begin, end):
-        length = wp.length(end - begin)
-    found[arena, i, j] = length
+        straight = wp.length(end - begin)
+    length[arena, i, j] = straight
 
 
 @wp.kernel(enable_backward=False)
@@ -216,7 +186,7 @@ def _path(
     to_go: wp.array3d[float],
     frame: wp.array3d[float],
     widened: float,
-    found: wp.array2d[float],
+    length: wp.array2d[float],
 ) -> None:
     """Measures the shortest path of a robot."""
     arena, robot = wp.tid()
@@ -225,7 +195,7 @@ def _path(
     if not _is_barred(frame, arena, widened, here, goal):
         least = wp.length(goal - here)
     for k in range(corner.shape[1]):
-        length = wp.length(corner[arena, k] - here) + to_go[arena, robot, k]
-        if length < least and not _is_barred(frame, arena, widened, here, corner[arena, k]):
-            least = length
-    found[arena, robot] = least
+        around = wp.length(corner[arena, k] - here) + to_go[arena, robot, k]
+        if around < least and not _is_barred(frame, arena, widened, here, corner[arena, k]):
+            least = around
+    length[arena, robot] = least

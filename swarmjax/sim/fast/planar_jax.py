@@ -49,10 +49,11 @@ class Contact(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Velocities or accelerations along x and y, of robots or of robots relative to others."""
+    """Velocities or accelerations, of robots or of pairs of robots (`turn` is then a sum)."""
 
     x: Array
     y: Array
+    turn: Array
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
@@ -69,8 +70,8 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
       acceleration of yaw.
     """
     one = contacts(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
-    free, before = (Motion(m[:, 0], m[:, 1]) for m in (robots.free, robots.before))
-    force = _first_force(one, _against(discs, before, len(one.give)))
+    free, before = Motion(*robots.free.T), Motion(*robots.before.T)
+    force = _first_force(one, against(discs, before, len(one.give)))
 
     def sweep(carry: tuple[Array, Array, Motion, Array]) -> tuple[Array, Array, Motion, Array]:
         done, force, motion, _ = carry
@@ -86,8 +87,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
     first = (jnp.int32(0), force, _pushed(one.gap, robots.mobility, free, force), touching)
     force = jax.lax.while_loop(goes_on, sweep, first)[1]
     # Recompute the accelerations from the forces, without the rounding of the sweeps.
-    moved = _pushed(one.gap, robots.mobility, free, force)
-    return jnp.stack([moved.x, moved.y, robots.free[:, 2]], axis=-1)
+    return jnp.stack(_pushed(one.gap, robots.mobility, free, force), axis=-1)
 
 
 def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
@@ -99,42 +99,59 @@ def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
     to_robot = _from_disc(x - x[other], y - y[other], ahead, discs.radius)
     to_robot = to_robot._replace(distance=jnp.where(meets == 0, jnp.inf, to_robot.distance))
     gap = DiscGap(*map(jnp.concatenate, zip(to_fixture, to_robot, strict=True)))
-    rate = Motion(robots.rate[:, 0], robots.rate[:, 1])
-    still = np.zeros((len(fixture), 1), np.float32)
+    rate = against(discs, Motion(*robots.rate.T), len(gap.x))
     weight, mobility = (
-        of_robots + jnp.concatenate([still * of_robots, of_robots[other]])
-        for of_robots in (robots.weight, robots.mobility)
+        a + of_others(discs, a, len(gap.x)) for a in (robots.weight, robots.mobility)
     )
-    return _contact(discs, gap, _against(discs, rate, len(gap.x)), weight, mobility)
+    return _contact(discs, gap, rate, weight, mobility)
 
 
-def _against(discs: Discs, motion: Motion, contacts: int) -> Motion:
+def of_others(discs: Discs, of_robots: Array, contacts: int) -> Array:
+    """Returns the values [K, R] of the robots that robots [R] may touch; 0 for fixtures."""
+    still = jnp.zeros((contacts - len(discs.opponent), len(of_robots)))
+    return jnp.concatenate([still, of_robots[discs.opponent]])
+
+
+def against(discs: Discs, motion: Motion, contacts: int) -> Motion:
     """Returns the motion [K, R] of robots [R] relative to their opponents; fixtures stand still."""
-    still = jnp.zeros((contacts - len(discs.opponent), len(motion.x)))
-    return Motion(*(a - jnp.concatenate([still, a[discs.opponent]]) for a in motion))
+    return _minus(motion, Motion(*(of_others(discs, a, contacts) for a in motion)))
+
+
+def against_row(discs: Discs, motion: Motion, row: int, contacts: int) -> Motion:
+    """Returns one row of `against`."""
+    meeting = row + len(discs.opponent) - contacts
+    if meeting < 0:
+        return motion
+    return _minus(motion, Motion(*(a[discs.opponent[meeting]] for a in motion)))
+
+
+def _minus(motion: Motion, other: Motion) -> Motion:
+    """Returns a motion relative to another.
+
+    Two robots that turn the same way slide on each other at twice the speed, so turns are added.
+    """
+    return Motion(motion.x - other.x, motion.y - other.y, motion.turn + other.turn)
 
 
 def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion:
     """Adds the accelerations due to forces [K, R]."""
     x, y = (jnp.sum(way * force, axis=0) for way in (gap.x, gap.y))
-    return Motion(free.x + mobility * x, free.y + mobility * y)
+    return Motion(free.x + mobility * x, free.y + mobility * y, free.turn)
 
 
 def _sweep(
     discs: Discs, contacts: Contact, mobility: Array, motion: Motion, force: Array
 ) -> tuple[Array, Motion]:
     """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
-    found, fixtures = [], len(force) - len(discs.opponent)
-    for k in range(len(force)):
+    forces = []
+    for k, now in enumerate(force):
         one = jax.tree.map(operator.itemgetter(k), contacts)
-        apart = motion
-        if k >= fixtures:
-            apart = Motion(*(a - a[discs.opponent[k - fixtures]] for a in motion))
-        best = _best_force(one, apart, force[k])
-        more = mobility * (best - force[k])
-        motion = Motion(motion.x + more * one.gap.x, motion.y + more * one.gap.y)
-        found.append(best)
-    return jnp.stack(found), motion
+        best = _best_force(one, against_row(discs, motion, k, len(force)), now)
+        more = mobility * (best - now)
+        x, y = motion.x + more * one.gap.x, motion.y + more * one.gap.y
+        motion = Motion(x, y, motion.turn)
+        forces.append(best)
+    return jnp.stack(forces), motion
 
 
 def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:

@@ -20,7 +20,7 @@ acceleration (D. G. Anderson, Iterative Procedures for Nonlinear Integral Equati
 
 import functools
 import operator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,8 @@ from jax import Array
 
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.fast import planar_jax
-from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, Rubbing, spring
-from swarmjax.sim.fast.planar_jax import Contact, DiscGap
+from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, spring
+from swarmjax.sim.fast.planar_jax import DiscGap, Motion, against, against_row, of_others
 
 KEPT = 3  # sweeps that a leap uses; a fourth saves 3 % in s6 (docs/performance.md)
 # Relative increase of a sum of squares. The increase is ten times float32's rounding. Without the
@@ -41,41 +41,36 @@ ROUNDING = 1e-6
 FLOOR = 2.4e-7
 
 
-class Rub(NamedTuple):
-    """Parameters of a contact along its face, counter-clockwise around the robot.
-
-    Attributes:
-      arm: lever arm from the robot's centre to the contact, m; 0 without contact.
-      demand: aref, requested acceleration along the face, m/s^2.
-      stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
-    """
-
-    arm: Array
-    demand: Array
-    stiffness: Array
-
-
-class Touch(NamedTuple):
-    """A contact: its normal part and its friction part."""
-
-    push: Contact
-    rub: Rub
-
-
 class Force(NamedTuple):
-    """Forces of a contact, N: along its normal, and along its face."""
+    """Forces of a contact, N, or what belongs to them: along its normal, and along its face.
+
+    The face points counter-clockwise around the robot.
+    """
 
     push: Array
     rub: Array
 
 
-class Swept(NamedTuple):
-    """The result of a sweep.
+class Touch(NamedTuple):
+    """A gap, and the contact's parameters if it is closed.
 
     Attributes:
-      force: forces of all contacts after the sweep.
-      change: change of the forces in the sweep.
+      gap: gap between the robot and the object.
+      arm: lever arm from the robot's centre to the contact, m; 0 without contact.
+      give: softness R: a unit of force misses the demand by this acceleration, 1 / kg.
+      demand: aref, requested accelerations, m/s^2.
+      stiffness: J M^-1 J' + R, effects of a unit of force, 1 / kg.
     """
+
+    gap: DiscGap
+    arm: Array
+    give: Array
+    demand: Force
+    stiffness: Force
+
+
+class Swept(NamedTuple):
+    """The result of a sweep: the forces of all contacts, and their change in the sweep."""
 
     force: Force
     change: Force
@@ -95,18 +90,10 @@ class Search(NamedTuple):
 
     done: Array
     force: Force
-    motion: "PlaneMotion"
+    motion: Motion
     last: Swept
     before: Swept
     moves: Array
-
-
-class PlaneMotion(NamedTuple):
-    """Velocities or accelerations, of robots or of pairs of robots (`turn` is then a sum)."""
-
-    x: Array
-    y: Array
-    turn: Array
 
 
 def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
@@ -114,52 +101,35 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
     Args:
       discs: constants.
-      robots: their state, accelerations without contacts, and `rubbing`.
+      robots: their state, and their accelerations without contacts.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
       [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
-    return solve(discs, robots, side, obstacle)[0]
-
-
-def solve(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> tuple[Array, Array]:
-    """Does the same as `push_apart`, and also returns the number of sweeps.
-
-    Args:
-      discs: constants.
-      robots: their state, accelerations without contacts, and `rubbing`.
-      side: [] side of the arena, m.
-      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-
-    Returns:
-      [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2; and the number of sweeps [],
-      int32.
-    """
-    touch = touches(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
-    free, before = (PlaneMotion(*move.T) for move in (robots.free, robots.before))
-    force = _first_force(touch, _against(discs, before, len(touch.rub.arm)), _friction(robots))
+    touch = _touches(discs, robots, sim_model.fixture_rectangles(side, obstacle, jnp))
+    free, before = Motion(*robots.free.T), Motion(*robots.before.T)
+    force = _first_force(discs, touch, against(discs, before, len(touch.arm)))
     none = Swept(*[Force(*map(jnp.zeros_like, force))] * 2)
-    touching = jnp.any(touch.push.gap.distance < 0.0)
-    motion = _moved(touch, robots, free, force)
-    first = Search(jnp.int32(0), force, motion, none, none, touching)
+    touching = jnp.any(touch.gap.distance < 0.0)
+    first = Search(jnp.int32(0), force, _moved(touch, robots, free, force), none, none, touching)
 
     def goes_on(now: Search) -> Array:
         return now.moves & (now.done < discs.sweeps)
 
-    least = _least_change(touch, _against(discs, free, len(touch.rub.arm)))
+    least = _least_change(touch, against(discs, free, len(touch.arm)))
     go_on = functools.partial(_go_on, discs, touch, robots, least)
-    found = jax.lax.while_loop(goes_on, go_on, first)
+    force = jax.lax.while_loop(goes_on, go_on, first).force
     # Recompute the accelerations from the forces, without the rounding of the sweeps.
-    return jnp.stack(_moved(touch, robots, free, found.force), axis=-1), found.done
+    return jnp.stack(_moved(touch, robots, free, force), axis=-1)
 
 
-def _least_change(touch: Touch, motion: PlaneMotion) -> Array:
+def _least_change(touch: Touch, motion: Motion) -> Array:
     """Returns the force, N, that rounding can cause; smaller changes are to be ignored."""
-    size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.rub.arm * jnp.abs(motion.turn)
-    closed = touch.push.gap.distance < 0.0
-    return FLOOR * jnp.max(jnp.where(closed, size / touch.push.stiffness, 0.0))
+    size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.arm * jnp.abs(motion.turn)
+    closed = touch.gap.distance < 0.0
+    return FLOOR * jnp.max(jnp.where(closed, size / touch.stiffness.push, 0.0))
 
 
 def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Search) -> Search:
@@ -173,12 +143,12 @@ def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Se
     # second half of the sweeps, since plain sweeps always come to rest.
     leaps = moves & (done >= KEPT) & (2 * done <= discs.sweeps)
     leaps &= _dot(swept.change, swept.change) <= _dot(now.last.change, now.last.change)
-    leapt = _leap(touch, robots, swept, now, leaps)
+    leapt = _leap(discs, touch, swept, now, leaps)
     motion = _moved(touch, robots, motion, _minus(leapt, force))
     return Search(done, leapt, motion, swept, now.last, moves)
 
 
-def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Array) -> Force:
+def _leap(discs: Discs, touch: Touch, swept: Swept, now: Search, leaps: Array) -> Force:
     """Returns the mix of the last three sweeps' forces that should change least in the next sweep.
 
     This assumes that a sweep is a linear map. A sweep is linear as long as no contact starts or
@@ -188,8 +158,7 @@ def _leap(touch: Touch, robots: DiscRobots, swept: Swept, now: Search, leaps: Ar
     by_newer, by_older = (jnp.where(leaps, x, 0.0) for x in _weights(swept.change, newer, older))
     steps = _minus(swept.force, now.last.force), _minus(now.last.force, now.before.force)
     mixed = (f - by_newer * a - by_older * b for f, a, b in zip(swept.force, *steps, strict=True))
-    stiffness = touch.push.stiffness, touch.rub.stiffness
-    return _where_closed(touch, project(Force(*mixed), *stiffness, _friction(robots)))
+    return _best(discs, touch, Force(*mixed), touch.stiffness)
 
 
 def _weights(change: Force, newer: Force, older: Force) -> tuple[Array, Array]:
@@ -211,130 +180,87 @@ def _minus(one: Force, other: Force) -> Force:
     return Force(one.push - other.push, one.rub - other.rub)
 
 
-def _rubbing(robots: DiscRobots) -> Rubbing:
-    """Returns the quantities for friction, which must be present."""
-    assert robots.rubbing is not None
-    return robots.rubbing
-
-
-def _friction(robots: DiscRobots) -> Array:
-    return _rubbing(robots).friction
-
-
-def touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
-    """Lists all possible contacts, in the order of `planar_jax.contacts`.
-
-    Args:
-      discs: constants.
-      robots: their state, accelerations without contacts, and `rubbing`.
-      fixture: [F, 5] x (m), y (m), yaw (rad), half edges (m).
-
-    Returns:
-      [K, R] each robot with each fixture, then with its opponent in each round.
-    """
-    push = planar_jax.contacts(discs, robots, fixture)
-    distance, count = push.gap.distance, len(fixture)
+def _touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
+    """Lists all possible contacts [K, R], in the order of `planar_jax.contacts`."""
+    gap, give, demand, stiffness = planar_jax.contacts(discs, robots, fixture)
     # MuJoCo puts a contact midway between the two surfaces.
-    arm = jnp.where(distance < 0.0, discs.radius + 0.5 * distance, 0.0)
-    agility = _rubbing(robots).agility
-    alone = jnp.broadcast_to(agility, (count, len(agility)))
-    turns = jnp.concatenate([alone, agility + agility[discs.opponent]])
-    rate = _against(discs, PlaneMotion(*robots.rate.T), len(arm))
-    demand = -spring(discs)[1] * _slide(push.gap, arm, rate)
-    return Touch(push, Rub(arm, demand, push.stiffness + arm * arm * turns))
+    arm = jnp.where(gap.distance < 0.0, discs.radius + 0.5 * gap.distance, 0.0)
+    turns = robots.agility + of_others(discs, robots.agility, len(arm))
+    rate = against(discs, Motion(*robots.rate.T), len(arm))
+    along = -spring(discs)[1] * _slide(gap, arm, rate)
+    stiffnesses = Force(stiffness, stiffness + arm * arm * turns)
+    return Touch(gap, arm, give, Force(demand, along), stiffnesses)
 
 
-def _against(discs: Discs, motion: PlaneMotion, contacts: int) -> PlaneMotion:
-    """Returns the motion [K, R] of robots [R] relative to their opponents; fixtures stand still.
-
-    Two robots that turn the same way slide on each other at twice the speed, so turns are added.
-    """
-    still = jnp.zeros((contacts - len(discs.opponent), len(motion.x)))
-    x, y, turn = (jnp.concatenate([still, a[discs.opponent]]) for a in motion)
-    return PlaneMotion(motion.x - x, motion.y - y, motion.turn + turn)
-
-
-def _slide(gap: DiscGap, arm: Array, motion: PlaneMotion) -> Array:
+def _slide(gap: DiscGap, arm: Array, motion: Motion) -> Array:
     """Returns J a along the face: how fast the robot's rim slides on the touched object."""
     return gap.x * motion.y - gap.y * motion.x - arm * motion.turn
 
 
-def _kick(touch: Touch, robots: DiscRobots, force: Force) -> PlaneMotion:
+def _kick(touch: Touch, robots: DiscRobots, force: Force) -> Motion:
     """Returns the accelerations due to each contact's forces alone."""
-    gap, mobility = touch.push.gap, robots.mobility
-    return PlaneMotion(
-        mobility * (gap.x * force.push - gap.y * force.rub),
-        mobility * (gap.y * force.push + gap.x * force.rub),
-        -_rubbing(robots).agility * touch.rub.arm * force.rub,
+    return Motion(
+        robots.mobility * (touch.gap.x * force.push - touch.gap.y * force.rub),
+        robots.mobility * (touch.gap.y * force.push + touch.gap.x * force.rub),
+        -robots.agility * touch.arm * force.rub,
     )
 
 
-def _moved(touch: Touch, robots: DiscRobots, free: PlaneMotion, force: Force) -> PlaneMotion:
+def _moved(touch: Touch, robots: DiscRobots, free: Motion, force: Force) -> Motion:
     """Adds the accelerations due to forces [K, R]."""
     kick = _kick(touch, robots, force)
-    return PlaneMotion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
+    return Motion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
 
 
 def _sweep(
-    discs: Discs, touch: Touch, robots: DiscRobots, motion: PlaneMotion, force: Force
-) -> tuple[Force, PlaneMotion]:
+    discs: Discs, touch: Touch, robots: DiscRobots, motion: Motion, force: Force
+) -> tuple[Force, Motion]:
     """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
-    found: list[Force] = []
-    fixtures, friction = len(force.push) - len(discs.opponent), _friction(robots)
+    forces: list[Force] = []
     for k in range(len(force.push)):
         one, now = jax.tree.map(operator.itemgetter(k), (touch, force))
-        apart = motion
-        if k >= fixtures:
-            other = discs.opponent[k - fixtures]
-            x, y, turn = (a[other] for a in motion)
-            apart = PlaneMotion(motion.x - x, motion.y - y, motion.turn + turn)
-        best = _best_force(one, apart, now, friction)
+        best = _best_force(discs, one, against_row(discs, motion, k, len(force.push)), now)
         kick = _kick(one, robots, _minus(best, now))
-        motion = PlaneMotion(*(a + b for a, b in zip(motion, kick, strict=True)))
+        motion = Motion(*(a + b for a, b in zip(motion, kick, strict=True)))
         # Without the barrier, XLA recomputes the inputs of both forces for every result.
         best, motion = jax.lax.optimization_barrier((best, motion))
-        found.append(best)
-    return Force(*map(jnp.stack, zip(*found, strict=True))), motion
+        forces.append(best)
+    return Force(*map(jnp.stack, zip(*forces, strict=True))), motion
 
 
-def _first_force(touch: Touch, motion: PlaneMotion, friction: Array) -> Force:
+def _first_force(discs: Discs, touch: Touch, motion: Motion) -> Force:
     """Returns the forces of contacts at this relative motion."""
-    push, rub = _short(touch, motion)
-    give = touch.push.give
-    force = project(Force(push / give, rub / give), give, give, friction)
-    return _where_closed(touch, force)
+    force = Force(*(short / touch.give for short in _short(touch, motion)))
+    return _best(discs, touch, force, Force(touch.give, touch.give))
 
 
-def _best_force(touch: Touch, motion: PlaneMotion, force: Force, friction: Array) -> Force:
+def _best_force(discs: Discs, touch: Touch, motion: Motion, force: Force) -> Force:
     """Returns the best forces of a contact while all other forces stay the same."""
-    push, rub = _short(touch, motion)
-    give, stiffness = touch.push.give, (touch.push.stiffness, touch.rub.stiffness)
-    push = force.push + (push - give * force.push) / stiffness[0]
-    rub = force.rub + (rub - give * force.rub) / stiffness[1]
-    return _where_closed(touch, project(Force(push, rub), *stiffness, friction))
+    each = zip(force, _short(touch, motion), touch.stiffness, strict=True)
+    wanted = Force(*(now + (short - touch.give * now) / k for now, short, k in each))
+    return _best(discs, touch, wanted, touch.stiffness)
 
 
-def _short(touch: Touch, motion: PlaneMotion) -> tuple[Array, Array]:
+def _short(touch: Touch, motion: Motion) -> Force:
     """Returns how far accelerations fall short of the contacts' demands, m/s^2."""
-    gap = touch.push.gap
-    push = touch.push.demand - planar_jax.along(gap, planar_jax.Motion(motion.x, motion.y))
-    return push, touch.rub.demand - _slide(gap, touch.rub.arm, motion)
+    push = touch.demand.push - planar_jax.along(touch.gap, motion)
+    return Force(push, touch.demand.rub - _slide(touch.gap, touch.arm, motion))
 
 
-def _where_closed(touch: Touch, force: Force) -> Force:
-    """Sets the forces of open gaps to 0."""
-    closed = touch.push.gap.distance < 0.0
+def _best(discs: Discs, touch: Touch, wanted: Force, weight: Force) -> Force:
+    """Returns the best forces of closed gaps, given the best ones outside the cone; 0 if open."""
+    closed, force = touch.gap.distance < 0.0, project(wanted, *weight, discs.friction)
     return Force(*(jnp.where(closed, each, 0.0) for each in force))
 
 
-def project(force: Force, push: Array, rub: Array, friction: Array) -> Force:
+def project(force: Force, push: Array, rub: Array, friction: Any) -> Force:
     """Returns the point of the cone |rub| <= friction * push that is nearest to these forces.
 
     Args:
       force: forces that may lie outside the cone.
       push: weight of the squared deviation of the push; above 0.
       rub: weight of the squared deviation of the rub; above 0.
-      friction: [] 0 or above.
+      friction: 0 or above.
 
     Returns:
       The forces themselves, if they lie in the cone; otherwise the nearest point of the cone's edge

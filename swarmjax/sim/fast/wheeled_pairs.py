@@ -5,27 +5,8 @@
 
 import warp as wp
 
-from swarmjax.sim.fast.wheeled_problem import (
-    FLAT,
-    PAIRS,
-    SEARCHES,
-    SHARED,
-    Matrix,
-    Problem,
-    Together,
-    Vector,
-    add,
-    does_switch,
-    entries_of,
-    factor_of,
-    goes_on,
-    inertia_of,
-    narrow,
-    of_robot,
-    put_robot,
-    substitute,
-    times,
-)
+from swarmjax.sim.fast import wheeled_problem as wheeled
+from swarmjax.sim.fast.wheeled_problem import Matrix, Problem, Together, Vector
 
 # Only one of SPREAD threads takes an arena. If all 32 threads of a warp read different places,
 # their reads take 32 turns.
@@ -61,7 +42,7 @@ def _collect(problem: Problem, together: Together, arena: int, robots: int) -> N
         if problem.touches[arena, robot]:
             for k in range(problem.own[arena, robot]):
                 side = problem.row[arena, robot, k]
-                if side[2] == SHARED and problem.first[arena, side[0]][0] == robot:
+                if side[2] == wheeled.SHARED and problem.first[arena, side[0]][0] == robot:
                     together.row[arena, count] = side[0]
                     count += 1
     together.count[arena] = count
@@ -71,8 +52,17 @@ def _collect(problem: Problem, together: Together, arena: int, robots: int) -> N
 def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
     """Multiplies a row of J between two robots by values of their joints."""
     first, second = problem.first[arena, row], problem.second[arena, row]
-    found = wp.dot(entries_of(problem, arena, first), of_robot(of_joints, arena, first[0]))
-    return found + wp.dot(entries_of(problem, arena, second), of_robot(of_joints, arena, second[0]))
+    total = _along_side(problem, arena, first, of_joints)
+    return total + _along_side(problem, arena, second, of_joints)
+
+
+@wp.func
+def _along_side(
+    problem: Problem, arena: int, side: wp.vec3i, of_joints: wp.array2d[float]
+) -> float:
+    """Multiplies a row's entries for one robot by values of its joints."""
+    entries = wheeled.entries_of(problem, arena, side)
+    return wp.dot(entries, wheeled.of_robot(of_joints, arena, side[0]))
 
 
 @wp.func
@@ -84,7 +74,7 @@ def _pick(problem: Problem, together: Together, arena: int) -> None:
         gap = _along(problem, arena, row, problem.qacc) - problem.aref[arena, row]
         together.gap[arena, row] = gap
         together.slot[arena, row] = -1
-        if gap < 0.0 and taken < PAIRS:
+        if gap < 0.0 and taken < wheeled.PAIRS:
             together.slot[arena, row] = taken
             together.pair[arena, taken] = row
             taken += 1
@@ -94,15 +84,15 @@ def _pick(problem: Problem, together: Together, arena: int) -> None:
 @wp.func
 def _descend(problem: Problem, together: Together, arena: int, robot: int) -> None:
     """Computes a robot's step without the separate terms, and the factor of its block."""
-    put_robot(together.step, arena, robot, Vector())
+    wheeled.put_robot(together.step, arena, robot, Vector())
     if problem.touches[arena, robot]:
-        hessian = inertia_of(problem, arena, robot)
-        now = of_robot(problem.qacc, arena, robot)
-        uphill = times(hessian, now) - of_robot(problem.force, arena, robot)
+        hessian = wheeled.inertia_of(problem, arena, robot)
+        now = wheeled.of_robot(problem.qacc, arena, robot)
+        uphill = wheeled.times(hessian, now) - wheeled.of_robot(problem.force, arena, robot)
         for k in range(problem.own[arena, robot]):
             side = problem.row[arena, robot, k]
-            slope = entries_of(problem, arena, side)
-            if side[2] != SHARED:
+            slope = wheeled.entries_of(problem, arena, side)
+            if side[2] != wheeled.SHARED:
                 gap = wp.dot(slope, now) - problem.aref[arena, side[0]]
                 together.gap[arena, side[0]] = gap
                 together.slot[arena, side[0]] = -1
@@ -110,10 +100,10 @@ def _descend(problem: Problem, together: Together, arena: int, robot: int) -> No
                 weighted = problem.D[arena, side[0]] * slope
                 uphill = uphill + together.gap[arena, side[0]] * weighted
                 if together.slot[arena, side[0]] < 0:
-                    hessian = add(hessian, weighted, slope)
-        factor = factor_of(hessian)
+                    hessian = wheeled.add(hessian, weighted, slope)
+        factor = wheeled.factor_of(hessian)
         together.factor[arena, robot] = factor
-        put_robot(together.step, arena, robot, substitute(factor, -uphill))
+        wheeled.put_robot(together.step, arena, robot, wheeled.substitute(factor, -uphill))
 
 
 @wp.func
@@ -128,21 +118,21 @@ def _couple(problem: Problem, together: Together, arena: int) -> None:
         for side in range(2):
             mine = _side(problem, arena, row, side)
             factor = together.factor[arena, mine[0]]
-            slope = entries_of(problem, arena, mine)
-            together.response[arena, i, side] = substitute(factor, slope)
+            slope = wheeled.entries_of(problem, arena, mine)
+            together.response[arena, i, side] = wheeled.substitute(factor, slope)
         matrix[i, i] = 1.0 / problem.D[arena, row]
     for i in range(taken):
         for j in range(i + 1):
             for sides in range(4):
                 push = _overlap(problem, together, arena, i, j, sides)
                 matrix[i, j] = matrix[i, j] + push
-    force = substitute(factor_of(matrix), right)
+    force = wheeled.substitute(wheeled.factor_of(matrix), right)
     for i in range(taken):
         for side in range(2):
             robot = _side(problem, arena, together.pair[arena, i], side)[0]
-            step = of_robot(together.step, arena, robot)
+            step = wheeled.of_robot(together.step, arena, robot)
             response = together.response[arena, i, side]
-            put_robot(together.step, arena, robot, step - force[i] * response)
+            wheeled.put_robot(together.step, arena, robot, step - force[i] * response)
 
 
 @wp.func
@@ -159,7 +149,7 @@ def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, s
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
     if mine[0] != theirs[0]:
         return 0.0
-    return wp.dot(entries_of(problem, arena, mine), together.response[arena, j, sides // 2])
+    return wp.dot(wheeled.entries_of(problem, arena, mine), together.response[arena, j, sides // 2])
 
 
 @wp.func
@@ -170,7 +160,7 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
         row = together.row[arena, k]
         slope = _along(problem, arena, row, together.step)
         together.slope[arena, row] = slope
-        switches = switches or does_switch(together.gap[arena, row], slope)
+        switches = switches or wheeled.does_switch(together.gap[arena, row], slope)
     for robot in range(robots):
         if problem.touches[arena, robot]:
             switches = _slopes(problem, together, arena, robot) or switches
@@ -180,25 +170,25 @@ def _take(problem: Problem, together: Together, arena: int, robots: int) -> bool
     largest, longest = wp.float32(0.0), wp.float32(0.0)
     for robot in range(robots):
         if problem.touches[arena, robot]:
-            now = of_robot(problem.qacc, arena, robot)
-            step = of_robot(together.step, arena, robot)
+            now = wheeled.of_robot(problem.qacc, arena, robot)
+            step = wheeled.of_robot(together.step, arena, robot)
             largest = wp.max(largest, wp.max(wp.abs(now)))
             longest = wp.max(longest, wp.max(wp.abs(step)))
-            put_robot(problem.qacc, arena, robot, now + length * step)
-    return goes_on(switches, longest, largest)
+            wheeled.put_robot(problem.qacc, arena, robot, now + length * step)
+    return wheeled.goes_on(switches, longest, largest)
 
 
 @wp.func
 def _slopes(problem: Problem, together: Together, arena: int, robot: int) -> bool:
     """Computes J times the step for a robot's own rows; returns whether any row switches."""
     switches = wp.bool(False)
-    step = of_robot(together.step, arena, robot)
+    step = wheeled.of_robot(together.step, arena, robot)
     for k in range(problem.own[arena, robot]):
         side = problem.row[arena, robot, k]
-        if side[2] != SHARED:
-            slope = wp.dot(entries_of(problem, arena, side), step)
+        if side[2] != wheeled.SHARED:
+            slope = wp.dot(wheeled.entries_of(problem, arena, side), step)
             together.slope[arena, side[0]] = slope
-            switches = switches or does_switch(together.gap[arena, side[0]], slope)
+            switches = switches or wheeled.does_switch(together.gap[arena, side[0]], slope)
     return switches
 
 
@@ -208,20 +198,20 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
     first, curve = wp.float32(0.0), wp.float32(0.0)
     for robot in range(robots):
         if problem.touches[arena, robot]:
-            inertia = inertia_of(problem, arena, robot)
-            step = of_robot(together.step, arena, robot)
-            now = of_robot(problem.qacc, arena, robot)
-            pull = times(inertia, now) - of_robot(problem.force, arena, robot)
+            inertia = wheeled.inertia_of(problem, arena, robot)
+            step = wheeled.of_robot(together.step, arena, robot)
+            now = wheeled.of_robot(problem.qacc, arena, robot)
+            pull = wheeled.times(inertia, now) - wheeled.of_robot(problem.force, arena, robot)
             first += wp.dot(pull, step)
-            curve += wp.dot(times(inertia, step), step)
+            curve += wp.dot(wheeled.times(inertia, step), step)
     begin = _tilt_together(problem, together, arena, robots, 0.0)[0] + first
     search = wp.vec3(0.0, 1e6, 1.0)
-    for _ in range(SEARCHES):
+    for _ in range(wheeled.SEARCHES):
         bend = _tilt_together(problem, together, arena, robots, search[2])
         tilt = bend[0] + first + search[2] * curve
-        if wp.abs(tilt) <= FLAT * wp.abs(begin):
+        if wp.abs(tilt) <= wheeled.FLAT * wp.abs(begin):
             break
-        search = narrow(search, tilt, bend[1] + curve)
+        search = wheeled.narrow(search, tilt, bend[1] + curve)
     return search[2]
 
 
@@ -237,7 +227,7 @@ def _tilt_together(
         if problem.touches[arena, robot]:
             for k in range(problem.own[arena, robot]):
                 side = problem.row[arena, robot, k]
-                if side[2] != SHARED:
+                if side[2] != wheeled.SHARED:
                     tilt = tilt + _tilt_of(problem, together, arena, side[0], length)
     return tilt
 

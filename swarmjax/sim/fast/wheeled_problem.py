@@ -125,34 +125,26 @@ def gather(m: Any, d: Any, robots: int) -> Any:
     problem.count, problem.J, problem.D, problem.aref = d.nefc, d.efc.J, d.efc.D, d.efc.aref
     problem.J_first, problem.J_count = d.efc.J_rowadr, d.efc.J_rownnz
     problem.J_column = d.efc.J_colind
-    problem.first = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
-    problem.second = wp.empty((d.nworld, d.njmax), dtype=wp.vec3i)
+    rows = d.nworld, d.njmax
+    problem.first, problem.second = wp.empty(rows, dtype=wp.vec3i), wp.empty(rows, dtype=wp.vec3i)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
-    most = _most_rows(m, robots)
+    # Most rows of a robot: 4 per wheel, 1 per skid, 1 per object near its hull (not the floor).
+    others = m.ngeom - 1 - _GEOMS * robots
+    most = 2 * 4 + 2 + robots - 1 + others
     problem.row = wp.empty((d.nworld, robots, most), dtype=wp.vec3i)
     problem.touches = wp.empty((d.nworld, robots), dtype=bool)
     problem.scaled = wp.empty((most, SLOPE + 1, d.nworld * robots), dtype=float)
     return problem
 
 
-def _most_rows(m: Any, robots: int) -> int:
-    """Returns the most rows of a robot: 4 per wheel, 1 per skid, 1 per object near its hull."""
-    others = m.ngeom - 1 - _GEOMS * robots  # without the floor
-    return 2 * 4 + 2 + robots - 1 + others
-
-
 def make_room(m: Any, d: Any, robots: int) -> Any:
     """Allocates the work arrays for robots that touch each other."""
-    arenas, together = d.nworld, Together()
+    arenas, rows, together = d.nworld, (d.nworld, d.njmax), Together()
     together.crowded = wp.empty(1, dtype=int)
-    together.arena = wp.empty(arenas, dtype=int)
-    together.count = wp.empty(arenas, dtype=int)
-    together.row = wp.empty((arenas, d.njmax), dtype=int)
+    together.arena, together.count, together.taken = (wp.empty(arenas, dtype=int) for _ in range(3))
+    together.row, together.slot = wp.empty(rows, dtype=int), wp.empty(rows, dtype=int)
+    together.gap, together.slope = wp.empty(rows, dtype=float), wp.empty(rows, dtype=float)
     together.step = wp.empty((arenas, m.nv), dtype=float)
-    together.gap = wp.empty((arenas, d.njmax), dtype=float)
-    together.slope = wp.empty((arenas, d.njmax), dtype=float)
-    together.slot = wp.empty((arenas, d.njmax), dtype=int)
-    together.taken = wp.empty(arenas, dtype=int)
     together.pair = wp.empty((arenas, PAIRS), dtype=int)
     together.factor = wp.empty((arenas, robots), dtype=Matrix)
     together.response = wp.empty((arenas, PAIRS, 2), dtype=Vector)
