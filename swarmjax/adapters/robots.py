@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from swarmjax.environment import Swarm, SwarmState
+from swarmjax.sim import drive
 
 
 class RobotStep(NamedTuple):
@@ -59,7 +60,7 @@ class RobotRow:
     @property
     def action_size(self) -> int:
         """Size of a robot's action, U: the command, then the message, if the robot sends one."""
-        return self.swarm.world.action_size
+        return drive.ACTION_SIZE
 
     def observe(self, state: SwarmState) -> Array:
         """Returns the [N, O] observations to act on."""
