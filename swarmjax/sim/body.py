@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 
 from swarmjax.sim.config import RobotConfig
-from swarmjax.sim.geometry import hull_name
 
 Array = Any
 Changes = dict[str, tuple[Any, Array]]  # by field of the model: rows, new values
@@ -47,7 +46,6 @@ class Rows(NamedTuple):
       wheel_geoms: [R, 2] left and right; [R, 0] for a body without wheels.
       wheel_bodies: [R, 2] left and right; [R, 0] for a body without wheels.
       grips: [R, 2] pairs of wheel and floor; [R, 0] for a body without wheels.
-      hulls: [P] pairs with a hull.
     """
 
     bodies: np.ndarray
@@ -56,7 +54,6 @@ class Rows(NamedTuple):
     wheel_geoms: np.ndarray
     wheel_bodies: np.ndarray
     grips: np.ndarray
-    hulls: np.ndarray
 
 
 class Servos(NamedTuple):
@@ -123,7 +120,6 @@ def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
         wheel_geoms=np.array(geoms, np.int32),
         wheel_bodies=np.array(model.geom_bodyid)[np.array(geoms, np.int32)],
         grips=np.array([[_pair(model, geom) for geom in pair] for pair in geoms], np.int32),
-        hulls=_hull_pairs(model, robots),
     )
 
 
@@ -148,13 +144,6 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
         "body_invweight0": (bodies, model.body_invweight0[bodies] / ratio[:, None, None]),
         "dof_invweight0": (dofs, model.dof_invweight0[dofs] / ratio[:, None]),
     }
-
-
-def _hull_pairs(model: mujoco.MjModel, robots: int) -> np.ndarray:
-    """Returns the pairs [P] that contain a hull."""
-    hulls = [model.geom(hull_name(f"robot{i}")).id for i in range(robots)]
-    first, second = (np.isin(geom, hulls) for geom in (model.pair_geom1, model.pair_geom2))
-    return np.flatnonzero(first | second).astype(np.int32)
 
 
 def _pair(model: mujoco.MjModel, geom: int) -> int:

@@ -55,12 +55,7 @@ def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
     """
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     place = [0.0, 0.0, CONTACT_HEIGHT]
-    return add_geom(body, hull_name(name), sphere, [radius, 0, 0], place, HULL_GROUP)
-
-
-def hull_name(robot: str) -> str:
-    """Returns the name of a robot's hull."""
-    return f"{robot}_hull"
+    return add_geom(body, f"{name}_hull", sphere, [radius, 0, 0], place, HULL_GROUP)
 
 
 def add_ray_hull(body: mujoco.MjsBody, name: str, radius: float) -> None:

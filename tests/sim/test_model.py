@@ -111,7 +111,9 @@ def test_only_hulls_touch(compiled: mujoco.MjModel) -> None:
 
 def test_hulls_rub_on_all_that_they_touch() -> None:
     compiled = model.build(RobotConfig(body="wheeled", hull_friction=0.5), SIZE, 0.016).compile()
-    hulls = model.ids(compiled, SIZE).robots.hulls
+    mine = [compiled.geom(f"robot{i}_hull").id for i in range(3)]
+    pairs = np.stack([compiled.pair_geom1, compiled.pair_geom2])
+    hulls = np.flatnonzero(np.isin(pairs, mine).any(axis=0))
     assert len(hulls) == 3 + 3 * 6
     assert (compiled.pair_dim[hulls] == 3).all()
     np.testing.assert_array_equal(compiled.pair_friction[hulls, :2], 0.5)
