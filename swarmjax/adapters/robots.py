@@ -11,7 +11,6 @@ import numpy as np
 from jax import Array
 
 from swarmjax.environment import Swarm, SwarmState
-from swarmjax.sim import drive
 
 
 class RobotStep(NamedTuple):
@@ -59,8 +58,8 @@ class RobotRow:
 
     @property
     def action_size(self) -> int:
-        """Size of a robot's action, U: the command, then the message, if the robot sends one."""
-        return drive.ACTION_SIZE
+        """Size of a robot's action, U."""
+        return self.swarm.action_space.shape[0]
 
     def observe(self, state: SwarmState) -> Array:
         """Returns the [N, O] observations to act on."""
