@@ -26,7 +26,7 @@ UV = os.environ.get("UV", "uv")  # `uv run` sets it
 RESOLUTIONS = {"oldest": "lowest-direct", "newest": "highest", "playground": "highest"}
 # Libraries that share an environment with swarmjax: more extras, and what calls them.
 EXTRAS = {"playground": ["playground"]}
-TOLD = ("jax", "flax", "optax", "chex", "numpy", "mujoco-mjx", "warp-lang")
+TOLD = ("jax", "flax", "optax", "orbax-checkpoint", "chex", "numpy", "mujoco-mjx", "warp-lang")
 TOLD += ("matplotlib", "rich", "tensorboardx", "playground", "brax")
 # Tests of what calls JAX, Flax, Optax and MuJoCo most; brax is not installed, and a test that
 # switches JAX to 64 bits does so as only JAX 0.8 and later can.

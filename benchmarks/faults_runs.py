@@ -286,10 +286,11 @@ Damage = Callable[[Path, np.random.Generator], object]
 
 
 def _newest(damage: Damage, run: Path, random: np.random.Generator) -> set[int]:
-    """Damages the newest checkpoints: one, two or three of them."""
+    """Damages a file of the newest checkpoints: of one, two or three of them."""
     steps = checkpoint.steps(run)[: int(random.integers(1, 4))]
     for step in steps:
-        damage(checkpoint.path_of(run, step), random)
+        files = sorted(p for p in checkpoint.path_of(run, step).rglob("*") if p.is_file())
+        damage(files[random.integers(len(files))], random)
     return set(steps)
 
 
@@ -306,9 +307,9 @@ def _cut(file: Path, random: np.random.Generator) -> None:
     file.write_bytes(content[: random.integers(len(content) + 1)])
 
 
-def _empty(file: Path, _: np.random.Generator) -> None:
-    """Empties a file."""
-    file.write_bytes(b"")
+def _delete(file: Path, _: np.random.Generator) -> None:
+    """Deletes a file."""
+    file.unlink()
 
 
 def _swap(run: Path, random: np.random.Generator) -> set[int]:
@@ -336,7 +337,8 @@ def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
     step = int(random.choice(checkpoint.steps(run)))
     given = checkpoint.path_of(_template() / source, step)
     if given.exists():
-        shutil.copy(given, checkpoint.path_of(run, step))
+        shutil.rmtree(checkpoint.path_of(run, step))
+        shutil.copytree(given, checkpoint.path_of(run, step))
         return {step}
     return set()
 
@@ -344,12 +346,9 @@ def _foreign(source: str, run: Path, random: np.random.Generator) -> set[int]:
 def _mix(run: Path, random: np.random.Generator) -> set[int]:
     """Combines the arrays of one checkpoint with the metadata of another checkpoint."""
     first, second = map(int, random.choice(checkpoint.steps(run), 2, replace=False))
-    with (
-        np.load(checkpoint.path_of(run, first)) as arrays,
-        np.load(checkpoint.path_of(run, second)) as other,
-    ):
-        mixed = {**arrays, "meta": other["meta"]}
-    np.savez(checkpoint.path_of(run, first), allow_pickle=False, **mixed)
+    to, of = (checkpoint.path_of(run, step) for step in (first, second))
+    shutil.rmtree(to / "state")
+    shutil.copytree(of / "state", to / "state")
     return {first}
 
 
@@ -362,7 +361,7 @@ def _config(run: Path, _: np.random.Generator) -> set[int]:
 _DAMAGES: dict[str, Callable[[Path, np.random.Generator], set[int]]] = {
     "flip": functools.partial(_newest, _flip),
     "cut": functools.partial(_newest, _cut),
-    "empty": functools.partial(_newest, _empty),
+    "delete": functools.partial(_newest, _delete),
     "swap": _swap,
     "rename": _rename,
     "twin": functools.partial(_foreign, "twin"),

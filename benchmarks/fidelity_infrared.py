@@ -146,10 +146,10 @@ def counts(name: Response, ray: np.ndarray | float, sensor: int = 0) -> np.ndarr
     return response.expected(name, rays, np)[..., sensor]
 
 
-def at_gap(gap: np.ndarray, name: Response = "real") -> np.ndarray:
+def at_gap(gap: np.ndarray) -> np.ndarray:
     """Returns the counts [..., K] of the sensors, each with an object ahead at gaps [...] (m)."""
     to_hull = np.array([way for *_, way in POSES]) * 1e-3
-    return response.expected(name, np.asarray(gap)[..., None] + to_hull, np)
+    return response.expected("real", np.asarray(gap)[..., None] + to_hull, np)
 
 
 def falls_to(reading: Callable[[float], float], level: float) -> float:

@@ -82,7 +82,7 @@ def prepare(settings: TrainConfig) -> Prepared:
     program, schedule = programs.load(settings)
     init = mesh.init(program)
     template: TrainState = jax.eval_shape(init, schedule)
-    keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
+    keys = jax.vmap(jax.random.key)(np.array(settings.numbers, np.uint32))
     train = partial(seeds.chunk(program), schedule)
     environments, arenas = partial(_environments, program), template.arenas
     return Prepared(
@@ -158,7 +158,7 @@ def _rollouts(settings: TrainConfig) -> int:
 
 def _actions(program: Program, key: Array) -> Array:
     """Draws uniform random actions [A, R, U]."""
-    shape = (program.config.arenas, program.config.sim.max_robots, program.world.action_size)
+    shape = (program.config.arenas, program.config.sim.max_robots, drive.ACTION_SIZE)
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 

@@ -15,7 +15,7 @@ from flax import struct
 from jax import Array
 
 from swarmjax import policy_file
-from swarmjax.sim import physics
+from swarmjax.sim import drive, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, TimeStep, World
@@ -106,7 +106,7 @@ class Swarm:
     @property
     def action_space(self) -> Space:
         """One robot's action, [U]: -1..1 spans the range of the command."""
-        ones = np.ones(self.world.action_size, np.float32)
+        ones = np.ones(drive.ACTION_SIZE, np.float32)
         names = policy_file.ACTION_NAMES
         return Space(ones.shape, names, ("1",) * len(names), -ones, ones)
 

@@ -38,6 +38,7 @@ DISTRIBUTIONS = {
     "PIL": "pillow",
     "absl": "absl-py",
     "imageio_ffmpeg": "imageio",
+    "orbax": "orbax-checkpoint",
     "warp": "warp-lang",
     "yaml": "pyyaml",
 }
@@ -136,6 +137,7 @@ def test_a_range_has_both_ends(asked: Requirement) -> None:
         ("jax", "JAX"),
         ("numpy", "NumPy"),
         ("optax", "Optax"),
+        ("orbax-checkpoint", "Orbax checkpoint"),
     ],
 )
 def test_the_page_names_the_oldest_and_the_newest_version(name: str, called: str) -> None:

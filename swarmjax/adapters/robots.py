@@ -58,8 +58,8 @@ class RobotRow:
 
     @property
     def action_size(self) -> int:
-        """Size of a robot's action, U: the command, then the message, if the robot sends one."""
-        return self.swarm.world.action_size
+        """Size of a robot's action, U."""
+        return self.swarm.action_space.shape[0]
 
     def observe(self, state: SwarmState) -> Array:
         """Returns the [N, O] observations to act on."""

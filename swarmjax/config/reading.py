@@ -90,17 +90,16 @@ def called(path: Path | str) -> str:
 # JSON
 
 
-def read_json(path: Path, most: int = MOST_MADE) -> Any:
+def read_json(path: Path) -> Any:
     """Reads a file with one JSON value.
 
     Args:
-      path: the file.
-      most: maximum size, bytes.
+      path: the file, at most `MOST_MADE` bytes.
 
     Raises:
       ConfigError: as in `read_text`, or if the file is not JSON.
     """
-    return parse_json(read_text(path, most), called(path))
+    return parse_json(read_text(path, MOST_MADE), called(path))
 
 
 def parse_json(text: str, where: str) -> Any:

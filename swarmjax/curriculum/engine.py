@@ -167,23 +167,6 @@ def schedule(
     )
 
 
-def last_begins(schedule: Schedule) -> int:
-    """Returns the update at which the last stage begins at the latest, from the deadlines alone.
-
-    Each decision comes at least one step limit after the one before.
-
-    Args:
-      schedule: the curriculum's numbers.
-
-    Returns:
-      The update: 0 for a single stage, and `NEVER` or more if a stage has no deadline.
-    """
-    begins = 0
-    for deadline in np.asarray(schedule.deadline)[:-1].tolist():
-        begins = max(deadline, begins + int(schedule.cohort_updates))
-    return begins
-
-
 def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
     """Starts a curriculum.
 

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
-from swarmjax.config.section import LAST_READER
 from swarmjax.policy import FORMAT, PolicyError
 from swarmjax.policy_file.reach import Inputs, check_reach
 
@@ -15,6 +14,7 @@ ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
 NETWORK = "network/"  # how the names of an extension's arrays begin
 
+_LAST_READER = "d8b3078"  # the last commit that reads formats 2 to 4
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
 _SMALLEST = float(np.finfo(np.float32).tiny)
@@ -165,7 +165,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     if meta.get("format") != FORMAT:
         raise PolicyError(
             f"meta.format is {short_json(meta.get('format'))}, but this version reads {FORMAT} "
-            f"only: {LAST_READER} is the last commit that reads formats 2 to 4."
+            f"only: {_LAST_READER} is the last commit that reads formats 2 to 4."
         )
     _check_fields(meta, _FIELDS)
     for field, rules in _OPTIONAL.items():

@@ -1,13 +1,24 @@
 """Checkpoints hold everything that changes in a run, and a digest of their contents.
 
-A checkpoint is one file of NumPy arrays, `checkpoints/UPDATE.npz`. Its arrays have names such as
-`learners/params/actor/mean/kernel`, so it can be read without the program that wrote it. Their
-first axis is the seed. The entry `meta` is a JSON text: the update, the run, a digest of its config
-and a digest of the arrays. So a damaged, renamed or foreign checkpoint is detected, and reading
-falls back to the newest sound one. Resuming is exact.
+A checkpoint is a folder, `checkpoints/UPDATE`:
+
+- Orbax writes the arrays to `state`, by names such as `learners/params/actor/mean/kernel`. Their
+  first axis is the seed.
+- `meta.json` has the update, the run, a digest of its config and a digest of the arrays.
+- `SHA256SUMS` has a digest of each file. `sha256sum -c SHA256SUMS` checks it.
+
+So a damaged, renamed or foreign checkpoint is detected, and reading falls back to the newest sound
+one. Resuming is exact.
 """
 
+import functools
+import hashlib
 import json
+import logging
+import os
+import re
+import shutil
+import sys
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -25,7 +36,8 @@ from swarmjax.run.errors import CheckpointError, TrainingError
 Leaves = dict[str, np.ndarray]
 
 FOLDER = hosts.CHECKPOINTS
-_META = "meta"  # the entry beside the arrays
+_STATE, _META, _SUMS = "state", "meta.json", "SHA256SUMS"
+_TEMPORARY = ".{}.tmp"  # the name of a folder while it is written or removed
 
 
 class Kept(NamedTuple):
@@ -45,13 +57,13 @@ class Kept(NamedTuple):
 
 
 def path_of(run: Path, update: int) -> Path:
-    """Returns the file of a run's checkpoint."""
-    return run / FOLDER / f"{update}.npz"
+    """Returns the folder of a run's checkpoint."""
+    return run / FOLDER / str(update)
 
 
 def steps(run: Path) -> list[int]:
     """Lists the updates of a run's checkpoints, sound or not, newest first."""
-    names = (path.stem for path in (run / FOLDER).glob("*.npz"))
+    names = (path.name for path in (run / FOLDER).glob("*"))
     return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
 
 
@@ -80,12 +92,13 @@ class Checkpoints:
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
         if update is not None and hosts.is_first():
-            for left in (run / FOLDER).glob(".*.tmp.npz"):  # a run was killed while it wrote
-                left.unlink()
-            aside = run / "passed_over"
+            for left in (run / FOLDER).glob(_TEMPORARY.format("*")):  # a run was killed
+                shutil.rmtree(left)
             for step in [step for step in steps(run) if step > update]:
-                aside.mkdir(exist_ok=True)
-                path_of(run, step).replace(aside / f"{step}.npz")
+                aside = run / "passed_over" / str(step)
+                shutil.rmtree(aside, ignore_errors=True)
+                aside.parent.mkdir(exist_ok=True)
+                path_of(run, step).rename(aside)
             directory.cut_rows(run / directory.SAVED, update + 1)
 
     def save(
@@ -131,28 +144,42 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
         update = meta["update"]
         try:
-            if self._owner and not (self._run / directory.CONFIG).exists():
-                raise OSError(f"{self._run} was removed")  # writing would make it again
+            if self._is_removed():  # writing would make the directory again
+                raise FileNotFoundError
             if _is_sound(leaves) and update not in steps(self._run):
-                self._write_file(leaves, meta | self._owner, row)
+                self._write_folder(leaves, meta | self._owner, row)
                 self._prune()
-        except OSError as error:
-            why = error.strerror or error
+        except Exception as error:  # Orbax raises errors of many types
+            why = f"{self._run} was removed" if self._is_removed() else _why(error)
             raise TrainingError(f"checkpoint {update} cannot be written: {why}.") from None
         heap.release()
 
-    def _write_file(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
+    def _is_removed(self) -> bool:
+        return bool(self._owner) and not (self._run / directory.CONFIG).exists()
+
+    def _write_folder(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
         meta |= {"digest": digest(leaves)}
-        content = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-        with replacing(path_of(self._run, meta["update"])) as temporary:
-            np.savez(temporary, allow_pickle=False, **leaves, **{_META: content})
+        folder = path_of(self._run, meta["update"])
+        temporary = folder.with_name(_TEMPORARY.format(folder.name))
+        shutil.rmtree(temporary, ignore_errors=True)  # of a run that was killed at its first one
+        temporary.mkdir(parents=True)
+        try:
+            with _orbax() as orbax:
+                orbax.save((temporary / _STATE).resolve(), leaves)
+            directory.write_json(temporary / _META, meta)
+            with replacing(temporary / _SUMS) as file:
+                file.write_text(_sums(temporary))
+            temporary.rename(folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
         with directory.Log(self._run / directory.SAVED) as log:
             log.write([{"update": meta["update"], "digest": meta["digest"], **row}])
 
     def _prune(self) -> None:
         """Removes all checkpoints except the newest ones."""
         for step in steps(self._run)[self._keep :]:
-            path_of(self._run, step).unlink()
+            folder = path_of(self._run, step)
+            shutil.rmtree(folder.rename(folder.with_name(_TEMPORARY.format(step))))
 
     def __enter__(self) -> "Checkpoints":
         """Returns itself."""
@@ -164,6 +191,56 @@ class Checkpoints:
             self.wait()
         finally:
             self._thread.shutdown()
+
+
+def _orbax() -> Any:
+    """Opens a `StandardCheckpointer` that waits for no other process of the run."""
+    import orbax.checkpoint as ocp  # a third of a second, which the saving thread spends
+
+    _silence()
+    own = jax.process_index()
+    return ocp.StandardCheckpointer(
+        multiprocessing_options=ocp.options.MultiprocessingOptions(
+            primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+        )
+    )
+
+
+@functools.cache
+def _silence() -> None:
+    """Silences what Orbax says beside our own sentence when a file cannot be written.
+
+    It then closes its event loop, but TensorStore still reports the other files to the loop.
+    """
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    report = sys.unraisablehook
+
+    def leave_out(unraisable: "sys.UnraisableHookArgs") -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            report(unraisable)
+
+    sys.unraisablehook = leave_out
+
+
+def _why(error: Exception) -> str:
+    """Returns the reason of a failed write; TensorStore gives it at the end of a long text."""
+    code = re.search(r"os_error_code='(\d+)'", str(error))
+    if code:
+        return os.strerror(int(code[1]))
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return reason.splitlines()[0][:200]
+
+
+def _sums(folder: Path) -> str:
+    """Returns the SHA-256 of each file of a checkpoint, as the program `sha256sum` writes it."""
+    lines = []
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != _SUMS:
+            with path.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256")
+            lines.append(f"{found.hexdigest()}  {path.relative_to(folder)}\n")
+    return "".join(lines)
 
 
 def _is_sound(leaves: Leaves) -> bool:
@@ -200,13 +277,16 @@ def find(run: Path, update: int | None = None) -> Kept:
     raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
 
 
-def _read(path: Path) -> tuple[Leaves, dict[str, Any]]:
-    """Reads a checkpoint, and checks the digest of its arrays."""
-    with np.load(path, allow_pickle=False) as file:
-        leaves = dict(file)
-    meta = json.loads(leaves.pop(_META).tobytes())
+def _read(folder: Path) -> tuple[Leaves, dict[str, Any]]:
+    """Reads a checkpoint, and checks the digests of its files and arrays."""
+    # Orbax refuses many damaged files too, but prints the tracebacks of its threads.
+    if (folder / _SUMS).read_text() != _sums(folder):
+        raise CheckpointError("its files do not match their digests")
+    meta = json.loads((folder / _META).read_text())
+    with _orbax() as orbax:
+        leaves = orbax.restore((folder / _STATE).resolve())
     if digest(leaves) != meta["digest"]:
-        raise CheckpointError("its contents do not match its digest")
+        raise CheckpointError("its arrays do not match their digest")
     return leaves, meta
 
 

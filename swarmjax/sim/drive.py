@@ -6,7 +6,7 @@ from swarmjax.sim.config import RobotConfig
 
 Array = Any
 
-COMMAND_SIZE = 2  # action entries that drive: forward speed and turn rate
+ACTION_SIZE = 2  # U: forward speed and turn rate
 
 
 class Drive(NamedTuple):

@@ -74,11 +74,6 @@ class World:
         """Size of an observation, O."""
         return self.electronics.layout.size
 
-    @property
-    def action_size(self) -> int:
-        """Size of an action, U."""
-        return sim_drive.COMMAND_SIZE
-
 
 @struct.dataclass
 class EnvState:
@@ -276,7 +271,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     Returns:
       The new state, and the outcome of the step.
     """
-    chex.assert_shape(action, (state.level.present.shape[0], world.action_size))
+    chex.assert_shape(action, (state.level.present.shape[0], sim_drive.ACTION_SIZE))
     level = state.level
     active = level.present & arrival.drives(world.task.arrival, state.arrived)
     clock = state.clock + 1
@@ -358,7 +353,7 @@ def _reward_step(
     return step._replace(
         pose_before=physics.poses(world.physics, before.sim),
         pose=pose,
-        action=jnp.clip(action[:, : sim_drive.COMMAND_SIZE], -1.0, 1.0),
+        action=jnp.clip(action, -1.0, 1.0),
         present=before.level.present,
         clock=after.clock,
     )

@@ -21,7 +21,6 @@ from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 
-ACTION_SIZE = drive.COMMAND_SIZE
 MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
@@ -105,7 +104,7 @@ def load_ppo(config: ProgramConfig, world: World) -> PPO:
     first = size - heard.size
     sizes = Sizes(
         observation=size,
-        action=world.action_size,
+        action=drive.ACTION_SIZE,
         state=surroundings.SIZE if config.algo.critic == "state" else 0,
         hearing=Hearing(first, heard.count, NEIGHBOUR_SIZE) if heard.count else None,
     )

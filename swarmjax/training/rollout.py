@@ -19,7 +19,7 @@ from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import ALONE, Shards
-from swarmjax.sim import gaps, physics
+from swarmjax.sim import drive, gaps, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
@@ -231,7 +231,7 @@ def _step(
     (arenas, judged, begun), (key, number) = carry, now
     count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
-    noise = _noise(program.shards, key, (*mine.shape[:-1], program.world.action_size))
+    noise = _noise(program.shards, key, (*mine.shape[:-1], drive.ACTION_SIZE))
     acting = explore(program, learners, number)
     memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.actor)
     action, log_prob, memory = jax.vmap(program.ppo.act)(acting, mine, noise, memory)

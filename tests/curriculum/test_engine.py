@@ -445,19 +445,6 @@ def test_deadline(schedule: Schedule) -> None:
     assert rows[4].success == UNKNOWN
 
 
-@pytest.mark.parametrize(
-    ("deadline", "begins"),
-    # A stage lasts at least a cohort of 2 updates: deadlines of 6 and 9 leave room for that, and
-    # deadlines of 1 and 2 become 2 and 4.
-    [([6, 9], 9), ([1, 2], 4), ([5, 6], 7)],
-)
-def test_the_last_stage_begins_by_the_deadlines_at_the_latest(
-    schedule: Schedule, deadline: list[int], begins: int
-) -> None:
-    numbers = schedule._replace(deadline=np.array([*deadline, NEVER], np.int32))
-    assert engine.last_begins(numbers) == begins
-
-
 def test_deadline_reports_what_was_measured(schedule: Schedule) -> None:
     _, rows = _run(schedule, [[Episode(NOW, 10, 5)]] + [[]] * 4)
     assert (rows[4].reason, rows[4].judged, rows[4].success) == (BY_BUDGET, 0, 0.5)

@@ -17,7 +17,6 @@ from swarmjax.sim import drive
 from swarmjax.task import observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import RewardConfig
-from swarmjax.training import program as programs
 
 FILES = Path(files.__file__).resolve().parents[2] / "configs"
 PAPER = load_train(["algo=paper"])
@@ -26,7 +25,7 @@ TABLE_1 = {
     "max training timesteps": (PAPER.budget, 1_000_000),
     "Max timesteps per episode": (PAPER.task.step_limit, 1500),
     "state space dimension": (observation.SIZE, 10),
-    "action space dimension": (programs.ACTION_SIZE, 2),
+    "action space dimension": (drive.ACTION_SIZE, 2),
     "discount factor (gamma)": (PAPER.algo.discount, 0.99),
     "PPO epsilon clip": (PAPER.algo.clip_epsilon, 0.2),
     "PPO K epochs": (PAPER.algo.epochs, 80),

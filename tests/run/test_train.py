@@ -367,8 +367,7 @@ def test_foreign_and_missing_runs_are_refused(
     assert "cannot be read" in _refusal(capsys, "export", f"run={tmp_path}")
     stored = to_dict(load_train(TINY))
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints" / "4.npz").write_bytes(b"")
+    (tmp_path / "checkpoints" / "4").mkdir(parents=True)
     assert "no sound checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 

@@ -85,8 +85,9 @@ def _refusal(
 
 
 def _flip_one_bit(run: Path, step: int) -> None:
-    """Damages a checkpoint, in the middle."""
-    file = checkpoint.path_of(run, step)
+    """Damages the largest file of a checkpoint, in the middle."""
+    files = checkpoint.path_of(run, step).rglob("*")
+    file = max(files, key=lambda path: path.is_file() * path.stat().st_size)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
