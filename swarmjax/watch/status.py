@@ -1,4 +1,4 @@
-"""Finds out from its directory whether a run trains, has ended, was stopped or was killed."""
+"""Finds out from its directory whether a run trains, has ended or has stopped early."""
 
 import json
 import os
@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from swarmjax import command, words
-from swarmjax.config import ConfigError
-from swarmjax.report import rows
 from swarmjax.run import directory
 from swarmjax.run.settings import TrainConfig
 
@@ -21,7 +19,7 @@ _TAIL = 2**22  # bytes that hold the newest rows of all seeds
 class RunStatus(NamedTuple):
     """State of a run, also as a sentence for a person to read."""
 
-    state: Literal["trains", "ended", "stopped", "killed"]
+    state: Literal["trains", "ended", "stopped"]
     sentence: str
 
 
@@ -69,29 +67,21 @@ def read(run: Path, trained: TrainConfig) -> RunStatus:
       run: its directory.
       trained: its config.
     """
-    try:
-        directory.check_regular(run)
-    except ConfigError as error:
-        return RunStatus("killed", str(error))
     logged = progress(run, trained.seeds)
     so_far = f"{logged.done:,} of {words.count(trained.updates, 'update')}"
     if _trains(run, logged):
         return RunStatus("trains", f"It trains: {so_far} done{_left(trained, logged)}.")
     if logged.done >= trained.updates:
         return RunStatus("ended", f"It has ended: {so_far} done.")
-    on = f"Go on with: {command.line('train', f'resume={run}')}"
-    if logged.done and _summed_up(run) == logged.done:
-        return RunStatus("stopped", f"It was stopped after {so_far}, with all saved. {on}")
-    return RunStatus("killed", f"It was killed, or broke, after {so_far}. {on}")
+    resume = command.line("train", f"resume={run}")
+    return RunStatus("stopped", f"It has stopped after {so_far}. Go on with: {resume}")
 
 
 def _trains(run: Path, logged: Progress) -> bool:
-    writer = directory.writer(run)
-    if writer is None:
-        return False
-    if writer.is_here:
-        return directory.is_writing(writer)
-    return logged.age is not None and logged.age < SILENT_S
+    is_written = directory.is_written(run)
+    if is_written is None:
+        return logged.age is not None and logged.age < SILENT_S
+    return is_written
 
 
 def _left(trained: TrainConfig, logged: Progress) -> str:
@@ -100,11 +90,3 @@ def _left(trained: TrainConfig, logged: Progress) -> str:
         return ""
     seconds = logged.seconds / logged.done * (trained.updates - logged.done)
     return f", about {words.duration(round(seconds))} left"
-
-
-def _summed_up(run: Path) -> int | None:
-    """Returns the updates in the summary, the last file that a run writes; None without one."""
-    try:
-        return rows.read_object(run / directory.SUMMARY).get("updates")
-    except (ConfigError, OSError):
-        return None
