@@ -14,7 +14,7 @@ from swarmjax.sim.config import SimConfig
 from swarmjax.task import fixed_level, maps
 from swarmjax.task.layouts import LAYOUTS
 from swarmjax.task.layouts.drawing import Kind
-from swarmjax.task.layouts.site import NUMBERS, ArenaLayout, Demand
+from swarmjax.task.layouts.site import NUMBERS, ArenaLayout
 from swarmjax.task.placement import UNITS
 
 # Area that a random level needs. A start and a target each take a square of 0.15 m (two hulls of
@@ -209,9 +209,9 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
-        numbers = {key: _ends(getattr(self, key)) for key in layout.reads}
+        numbers = {key: _ends(getattr(self, key))[1] for key in layout.reads}
         sizes = {"side": self.sides[0], "breadth": _ends(self.breadth or self.side)[0]}
-        demand = Demand(self.robots, sizes["side"], sizes["breadth"], numbers)
+        demand = {"robots": self.robots, **sizes, **numbers}
         for (key, found), least in zip(sizes.items(), layout.least(demand), strict=True):
             if found < least - 1e-9:
                 with_ = " ".join(f"{key}={show(getattr(self, key))}" for key in layout.reads)
