@@ -9,10 +9,6 @@ from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
 
-# Most arenas of all seeds with run.episodes=true. With more arenas, thousands of episodes end per
-# second.
-MOST_LOGGED = 8192
-
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Section):
@@ -116,7 +112,6 @@ class TrainConfig(ProgramConfig):
         self._check_budget()
         self._check_counts()
         self._check_hearing()
-        self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
             object.__setattr__(self, "streams", self.stream_count)
@@ -175,13 +170,6 @@ class TrainConfig(ProgramConfig):
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, which is enough "
                 f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: "
                 f"give at most {most}."
-            )
-
-    def _check_episodes(self) -> None:
-        if self.run.episodes and self.arenas * self.seeds > MOST_LOGGED:
-            raise ConfigError(
-                f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
-                f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
             )
 
     def _check_hearing(self) -> None:

@@ -153,8 +153,6 @@ class StageConfig(Section):
     def _check_fixed(self) -> None:
         if self.layout == "fence" and self.level != "fixed":
             raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
-        if self.layout == "fence" and self.obstacles < 1:
-            raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
         if self.level != "fixed":
             return
         if isinstance(self.side, tuple):
@@ -333,14 +331,11 @@ class GridConfig(Section):
     )
 
     def _check(self) -> None:
-        for key in ("robots", "obstacles", "side"):
-            if not getattr(self, key):
-                raise ConfigError(f"{key} is []: give at least one number.")
         if not self.stages():
-            least = _smallest_side(min(self.robots), min(self.obstacles), self.obstacle_size)
             raise ConfigError(
-                f"side is {show(self.side)}, too small for every cell of the grid: even the fewest "
-                f"robots and obstacles need {math.ceil(100 * least) / 100}."
+                f"side is {show(self.side)}, which no cell of the grid fits with robots="
+                f"{show(self.robots)} and obstacles={show(self.obstacles)}: give at least one "
+                "number of each, and larger sides."
             )
 
     def stages(self) -> tuple[StageConfig, ...]:
