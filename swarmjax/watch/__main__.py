@@ -27,6 +27,7 @@ def main(arguments: Sequence[str]) -> int:
     from swarmjax.watch.view import Views
 
     views = Views(settings)
+    views.draw()
     with Server(settings.port, views) as server:
         views.follow()
         sys.stdout.write(f"{server.url} follows {settings.run}; Ctrl-C ends it.\n")

@@ -61,7 +61,7 @@ class Views:
     def state(self) -> dict[str, Any]:
         """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
-        now = status.read(self.run, self.trained)
+        now = status.read(self.run, self.trained, self.history)
         return {
             **now._asdict(),
             "facts": [] if self.history is None else report_page.facts(self.history),
