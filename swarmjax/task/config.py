@@ -15,38 +15,31 @@ _MOST_WEIGHT = 1e6
 NEIGHBOUR_SIZE = 4  # observation entries of a neighbour: presence, distance, cosine, sine
 
 
-def _weight(meaning: str) -> dict[str, Any]:
-    """Returns the metadata of a reward weight."""
-    return about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
+def _weight(default: float, meaning: str) -> Any:
+    """Returns the field of a reward weight."""
+    return field(default=default, metadata=about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
     """Weights of the reward terms: equation 3 of the paper, and penalties."""
 
-    progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
-    path_progress: float = field(
-        default=0.0,
-        metadata=_weight("per metre nearer along the shortest path around walls and boxes"),
+    progress: float = _weight(1.0, "per metre nearer to the target")
+    path_progress: float = _weight(
+        0.0, "per metre nearer along the shortest path around walls and boxes"
     )
-    proximity: float = field(
-        default=0.0,
-        metadata=_weight("per control step before arrival with an object in infrared range"),
+    proximity: float = _weight(
+        0.0, "per control step before arrival with an object in infrared range"
     )
-    arrival: float = field(
-        default=0.0,
-        metadata=_weight("once, on arrival; with arrival=hold, when all robots have arrived"),
+    arrival: float = _weight(
+        0.0, "once, on arrival; with arrival=hold, when all robots have arrived"
     )
-    contact: float = field(default=-0.2, metadata=_weight("per contact event of any kind"))
-    touching: float = field(
-        default=0.0, metadata=_weight("per control step in which the robot touches something")
-    )
-    step_penalty: float = field(
-        default=-0.002, metadata=_weight("per control step that begins before arrival")
-    )
+    contact: float = _weight(-0.2, "per contact event of any kind")
+    touching: float = _weight(0.0, "per control step in which the robot touches something")
+    step_penalty: float = _weight(-0.002, "per control step that begins before arrival")
     extra: dict[str, float] = field(
         default_factory=ByName,
-        metadata=_weight("weights of extension terms, by name; 0: off"),
+        metadata=about("weights of extension terms, by name; 0: off", -_MOST_WEIGHT, _MOST_WEIGHT),
     )
 
 

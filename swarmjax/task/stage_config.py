@@ -68,9 +68,9 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     return found
 
 
-def _length(meaning: str, low: float, high: float) -> dict[str, Any]:
-    """Returns the metadata of a layout's length."""
-    return about(f"{meaning}, m, or a range", low, high)
+def _length(meaning: str, low: float, high: float) -> Any:
+    """Returns the field of a layout's length."""
+    return field(default=None, metadata=about(f"{meaning}, m, or a range", low, high))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,26 +107,13 @@ class StageConfig(Section):
         ),
     )
     cell: float = field(default=0.12, metadata=about("edge of a map cell, m", _SMALLEST_CELL, 1.0))
-    breadth: _Length = field(
-        default=None,
-        metadata=_length("breadth of a layout's arena (null: as long as side)", 0.2, 4.0),
-    )
-    gap: _Length = field(
-        default=None, metadata=_length("free width of a door or a corridor", _SMALLEST_CELL, 1.0)
-    )
-    width: _Length = field(
-        default=None,
-        metadata=_length("free width of a trap, or of a corridor at its bay", 0.1, 2.0),
-    )
-    depth: _Length = field(default=None, metadata=_length("depth of a trap", 0.05, 2.0))
-    length: _Length = field(default=None, metadata=_length("length of a fence or a bay", 0.1, 4.0))
-    radius: _Length = field(
-        default=None, metadata=_length("radius of the circle of starts", 0.1, 1.9)
-    )
-    apart: _Length = field(
-        default=None,
-        metadata=_length("distance between targets, or from targets to a door", 0.05, 1),
-    )
+    breadth: _Length = _length("breadth of a layout's arena (null: as long as side)", 0.2, 4.0)
+    gap: _Length = _length("free width of a door or a corridor", _SMALLEST_CELL, 1.0)
+    width: _Length = _length("free width of a trap, or of a corridor at its bay", 0.1, 2.0)
+    depth: _Length = _length("depth of a trap", 0.05, 2.0)
+    length: _Length = _length("length of a fence or a bay", 0.1, 4.0)
+    radius: _Length = _length("radius of the circle of starts", 0.1, 1.9)
+    apart: _Length = _length("distance between targets, or from targets to a door", 0.05, 1)
     cells: int | None = field(default=None, metadata=about("cells along a maze's side", 2, 6))
 
     def _check(self) -> None:
