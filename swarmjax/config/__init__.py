@@ -7,7 +7,7 @@ section configures. This package imports no other package of the project. Start 
 `section.build`.
 """
 
-from swarmjax.config.section import Section, about, build, to_dict
+from swarmjax.config.section import Section, about, build, setting, to_dict
 from swarmjax.config.values import ConfigError, check_text, show
 
-__all__ = ["ConfigError", "Section", "about", "build", "check_text", "show", "to_dict"]
+__all__ = ["ConfigError", "Section", "about", "build", "check_text", "setting", "show", "to_dict"]

@@ -11,7 +11,7 @@ import math
 import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 from swarmjax.config import values
@@ -93,6 +93,11 @@ def about(  # most calls give two or three
     """
     bounds = Bounds(low, high, above, below, reason)
     return {"meaning": meaning, "bounds": bounds, "derived": derived, "stored": stored}
+
+
+def setting[T](default: T, meaning: str, *limits: float, **options: Any) -> T:
+    """Returns a field with a default. The other arguments are those of `about`."""
+    return field(default=default, metadata=about(meaning, *limits, **options))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, files, show
+from swarmjax.config import ConfigError, Section, about, files, setting, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
@@ -17,7 +17,7 @@ NEIGHBOUR_SIZE = 4  # observation entries of a neighbour: presence, distance, co
 
 def _weight(default: float, meaning: str) -> Any:
     """Returns the field of a reward weight."""
-    return field(default=default, metadata=about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT))
+    return setting(default, meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class RewardConfig(Section):
 class NeighboursConfig(Section):
     """What a robot receives from other robots: range and bearing."""
 
-    count: int = field(default=0, metadata=about("nearest neighbours observed; 0: none", 0, 32))
+    count: int = setting(0, "nearest neighbours observed; 0: none", 0, 32)
     range: float = field(
         # AutoMoDe's reference models use a range-and-bearing board. We assume the range of that
         # board.
@@ -65,40 +65,27 @@ class NeighboursConfig(Section):
 class TaskConfig(Section):
     """What a robot is asked to do, and what it senses."""
 
-    control_step: float = field(
-        default=0.032, metadata=about("control step, s; Webots basicTimeStep", 0.001, 0.2)
+    control_step: float = setting(0.032, "control step, s; Webots basicTimeStep", 0.001, 0.2)
+    step_limit: int = setting(500, "control steps of a training episode", 1, MAX_COUNT)
+    target_radius: float = setting(
+        0.05,
+        "distance between the centres of robot and target that counts as arrival, m",
+        above=0.0,
+        high=0.1,
     )
-    step_limit: int = field(
-        default=500, metadata=about("control steps of a training episode", 1, MAX_COUNT)
+    arrival: Arrival = setting(
+        "latch",
+        "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
+        "and the episode is complete when all are within their targets at once",
     )
-    target_radius: float = field(
-        default=0.05,
-        metadata=about(
-            "distance between the centres of robot and target that counts as arrival, m",
-            above=0.0,
-            high=0.1,
-        ),
+    sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
+    encoding: Literal["auto", "metric", "webots"] = setting(
+        "auto",
+        "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
+        "realism.infrared=webots, else metric",
     )
-    arrival: Arrival = field(
-        default="latch",
-        metadata=about(
-            "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
-            "and the episode is complete when all are within their targets at once"
-        ),
-    )
-    sensor_range: float = field(
-        default=epuck.SENSOR_RANGE, metadata=about("infrared range, m", above=0.0, high=1.0)
-    )
-    encoding: Literal["auto", "metric", "webots"] = field(
-        default="auto",
-        metadata=about(
-            "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
-            "realism.infrared=webots, else metric"
-        ),
-    )
-    observations: tuple[str, ...] | None = field(
-        default=None,
-        metadata=about("observations of extensions, in order; null: all of them"),
+    observations: tuple[str, ...] | None = setting(
+        None, "observations of extensions, in order; null: all of them"
     )
     neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
