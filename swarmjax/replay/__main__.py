@@ -31,7 +31,6 @@ from swarmjax import command, outputs
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.trials import Entrant
 from swarmjax.replay import page as replay_page
 from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
@@ -62,21 +61,14 @@ def main(arguments: Sequence[str]) -> int:
             replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
     for each in entrants:
-        if missing := _left_out(settings, each):
+        weights = record.weights(each.policy, settings.task).extra
+        if missing := ", ".join(name for name, weight in weights.items() if weight):
             sys.stdout.write(f"{each.path}: the rewards leave out {missing}\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:
         sys.stdout.write(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.\n")
     return 0
-
-
-def _left_out(settings: ReplayConfig, entrant: Entrant) -> str:
-    """Names the reward terms of training that are not shown, since their code is missing."""
-    earning = record.weights(entrant.policy, settings.task)
-    own = record.own_terms(entrant.policy, settings.extensions, earning)
-    known = {piece.name for piece, _ in own}
-    return ", ".join(name for name, weight in earning.extra.items() if weight and name not in known)
 
 
 def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:

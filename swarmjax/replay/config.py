@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass, field, fields
 from typing import ClassVar
 
-from swarmjax.config import ConfigError, about, show
+from swarmjax.config import ConfigError, about, setting, show
 from swarmjax.evaluate.config import EvaluateConfig, JudgeConfig
 
 
@@ -15,15 +15,12 @@ class ReplayConfig(JudgeConfig):
     command: ClassVar[str] = "replay"
 
     policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
-    level: str | None = field(
-        default=None,
-        metadata=about("numbers of the levels, as in 0,7,12; null: 0, unless worst is given"),
+    level: str | None = setting(
+        None, "numbers of the levels, as in 0,7,12; null: 0, unless worst is given"
     )
-    worst: int | None = field(
-        default=None, metadata=about("replay this many of the worst episodes", 1, 100)
-    )
-    out: str = field(default="replay.html", metadata=about("HTML file of the replay"))
-    video: str | None = field(default=None, metadata=about("MP4 file of the scene in 3-D"))
+    worst: int | None = setting(None, "replay this many of the worst episodes", 1, 100)
+    out: str = setting("replay.html", "HTML file of the replay")
+    video: str | None = setting(None, "MP4 file of the scene in 3-D")
 
     def _check(self) -> None:
         super()._check()

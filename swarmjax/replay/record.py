@@ -1,6 +1,6 @@
 """Records episodes step by step from the judge in MuJoCo's C engine.
 
-Only shortest paths and terms of an extension need JAX.
+Only shortest paths need JAX.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,11 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import extension
 from swarmjax.config.section import build_stored
 from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
-from swarmjax.extension import RewardTerm
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
 from swarmjax.task import arrival, electronics, reward
@@ -92,7 +90,6 @@ class Frame(NamedTuple):
       touching: [A, R, 3] whether the robot touches something of each kind.
       arrived: [A, R] whether the robot has arrived; with `hold`, whether it is within its target.
       contacts: [A, R, 3] contacts so far of each kind.
-      action: [A, R, 2] action that led here, clipped to -1..1; 0 at the start.
     """
 
     pose: np.ndarray
@@ -101,7 +98,6 @@ class Frame(NamedTuple):
     touching: np.ndarray
     arrived: np.ndarray
     contacts: np.ndarray
-    action: np.ndarray
 
 
 def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
@@ -130,17 +126,16 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
       ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
     """
     earning = weights(judge.policy, judge.config.task)
-    own = own_terms(judge.policy, judge.config.extensions, earning)
     arenas = engine_c.start(judge, levels)
     mount = electronics.mount(arenas.factors)
-    frames = [_look(judge, arenas, np.zeros_like(arenas.pose[..., :2]))]
+    frames = [_look(judge, arenas)]
     over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
     driver = engine_c.ByPolicy(judge)
     memory = driver.init(arenas)
     while len(frames) <= judge.config.step_limit and not over.all():
         memory, action = driver.act(memory, arenas)
         arenas = engine_c.step(judge, arenas, action)
-        frames.append(_look(judge, arenas, np.clip(action[..., :2], -1.0, 1.0)))
+        frames.append(_look(judge, arenas))
         over |= frames[-1].arrived.all(axis=-1)
     every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
     return [
@@ -150,34 +145,12 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
             _scene(level, mount, i),
             judge,
             earning,
-            own,
         )
         for i, level in enumerate(levels)
     ]
 
 
-def own_terms(
-    trained: Policy, extensions: str | None, earning: RewardConfig
-) -> tuple[tuple[RewardTerm, float], ...]:
-    """Finds the reward terms of an extension that a policy was trained with.
-
-    Args:
-      trained: The policy; its file has the digest of each term.
-      extensions: As the setting of that name.
-      earning: The policy's weights.
-
-    Returns:
-      Each term whose code has not changed, with its weight. Terms with weight 0 are left out.
-    """
-    digests = trained.meta.get("extensions", {}).get("reward", {})
-    return tuple(
-        (piece, earning.extra[piece.name])
-        for piece in extension.load(extensions).rewards
-        if digests.get(piece.name) == piece.digest and earning.extra.get(piece.name)
-    )
-
-
-def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
+def _look(judge: Judge, arenas: Arenas) -> Frame:
     """Takes a frame of all arenas."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
@@ -189,7 +162,6 @@ def _look(judge: Judge, arenas: Arenas, action: np.ndarray) -> Frame:
         touching=contacts.touching(judge, arenas.data),
         arrived=arenas.outcome.arrived,
         contacts=arenas.outcome.contacts,
-        action=action,
     )
 
 
@@ -199,7 +171,6 @@ def _cut(
     scene: ReplayScene,
     judge: Judge,
     earning: RewardConfig,
-    own: Sequence[tuple[RewardTerm, float]],
 ) -> Recording:
     """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
     task, over = judge.config.task, frames.arrived.all(axis=-1)
@@ -219,7 +190,7 @@ def _cut(
     if earning.path_progress:
         path = _measure_paths(level, frames.pose, judge.config.robot.hull_radius)
         steps = steps._replace(path_before=path[:-1], path=path[1:])
-    earned = reward.weighted(steps, earning) | _own(own, steps, frames)
+    earned = reward.weighted(steps, earning)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
         scene=scene,
@@ -257,24 +228,6 @@ def _since(arrived: np.ndarray) -> np.ndarray:
     """Finds the row [R] at which robots arrive [N, R] and stay to the end; 0 if they never do."""
     away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
     return np.where(arrived[-1], away + 1, 0)
-
-
-def _own(
-    own: Sequence[tuple[RewardTerm, float]], steps: reward.Step, frames: Frame
-) -> dict[str, np.ndarray]:
-    """Computes the reward terms of an extension, [N, R] by name."""
-    if not own:
-        return {}
-    from swarmjax.task import extended  # extensions run on JAX
-
-    whole = steps._asdict() | {
-        "pose_before": frames.pose[:-1],
-        "pose": frames.pose[1:],
-        "action": frames.action[1:],
-        "present": np.ones(steps.distance.shape, bool),
-        "clock": np.arange(1, len(frames.pose), dtype=np.int32),
-    }
-    return {piece.name: weight * extended.earn(piece, whole) for piece, weight in own}
 
 
 def _scene(level: Level, mount: infrared.Mount | None, i: int) -> ReplayScene:

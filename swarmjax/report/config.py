@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from swarmjax.config import ConfigError, Section, about
+from swarmjax.config import ConfigError, Section, setting
 from swarmjax.outputs import OVERWRITE
 
 
@@ -13,18 +13,13 @@ class ReportConfig(Section):
 
     command: ClassVar[str] = "report"
 
-    run: str | None = field(default=None, metadata=about("run directory"))
-    runs: str | None = field(
-        default=None,
-        metadata=about(
-            "instead of run: run directories, folders of runs (an array, a sweep), "
-            "separated by commas; prints a table with one line for all runs of the same settings"
-        ),
+    run: str | None = setting(None, "run directory")
+    runs: str | None = setting(
+        None,
+        "instead of run: run directories, folders of runs (an array, a sweep), "
+        "separated by commas; prints a table with one line for all runs of the same settings",
     )
-    out: str | None = field(
-        default=None,
-        metadata=about("directory of the report of a run; null: <run>/report"),
-    )
+    out: str | None = setting(None, "directory of the report of a run; null: <run>/report")
     overwrite: bool = field(default=False, metadata=OVERWRITE)
 
     def _check(self) -> None:

@@ -18,7 +18,7 @@ import secrets
 import socket
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from swarmjax.config import ConfigError
 from swarmjax.outputs import replacing
@@ -41,60 +41,40 @@ def new_id() -> str:
 
 
 @contextlib.contextmanager
-def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
+def locked(run: Path) -> Iterator[None]:
     """Keeps other processes out of a run directory, and makes it if it is missing.
 
     Args:
       run: the directory.
-      claimed: whether `claim` has made it. It is removed if the run then writes nothing.
 
     Raises:
       ConfigError: if another process is writing the directory, or it cannot be written.
     """
-    missing = [path for path in (run, *run.parents) if not path.exists()]
-    made = missing or [run, run.parent] * claimed
     with contextlib.ExitStack() as held:
         try:
             run.mkdir(parents=True, exist_ok=True)
             _lock(run, held)
         except OSError as error:
             raise unwritable(run, error) from None
-        try:
-            yield
-        finally:
-            _remove_empty(run, made)
+        yield
 
 
 def _lock(run: Path, held: contextlib.ExitStack) -> None:
     """Locks a run directory, and writes into the lock which process holds it."""
-    path = run / LOCK
-    while True:
-        file = held.enter_context(path.open("a+"))
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = file.readline().strip() or "another process"
-            raise ConfigError(
-                f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
-                "directory."
-            ) from None
-        # Another process may have removed the file between opening and locking.
-        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-            break
+    file = held.enter_context((run / LOCK).open("a+"))
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        holder = file.readline().strip() or "another process"
+        raise ConfigError(
+            f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
+            "directory."
+        ) from None
     with contextlib.suppress(OSError):  # a full disk; the lock works without a name
         file.truncate(0)
         file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
         file.flush()
-
-
-def _remove_empty(run: Path, made: list[Path]) -> None:
-    """Removes the directories that were made, if the run then wrote nothing."""
-    with contextlib.suppress(OSError):  # already removed, or owned by another user
-        if made and os.listdir(run) == [LOCK]:
-            (run / LOCK).unlink()
-            for path in made:
-                path.rmdir()
 
 
 def claim(folder: Path, name: str) -> Path:
@@ -128,59 +108,24 @@ def visible(run: Path) -> list[str]:
         return []
 
 
-class Writer(NamedTuple):
-    """The process that last wrote a run directory.
-
-    Attributes:
-      process: its process id on its machine.
-      host: its machine.
-    """
-
-    process: int
-    host: str
-
-    @property
-    def is_here(self) -> bool:
-        """Whether the process ran on this machine."""
-        return self.host == socket.gethostname()
-
-
-def writer(run: Path) -> Writer | None:
-    """Reads which process holds or held the lock of a run directory; None if unknown."""
-    try:
-        process, host = (run / LOCK).read_text().splitlines()
-        return Writer(int(process.removeprefix("process ")), host)
-    except (OSError, ValueError):
-        return None
-
-
-def is_writing(found: Writer) -> bool:
-    """Returns whether the process of a writer on this machine is still running.
+def is_written(run: Path) -> bool | None:
+    """Returns whether the process that last wrote a run directory still runs.
 
     Acquiring the lock as a test would keep out a run that begins at the same moment.
+
+    Returns:
+      None if the process ran on another machine.
     """
     try:
-        os.kill(found.process, 0)
+        process, host = (run / LOCK).read_text().splitlines()
+        if host != socket.gethostname():
+            return None
+        os.kill(int(process.removeprefix("process ")), 0)
     except PermissionError:  # the process belongs to another user
         return True
-    except (OSError, OverflowError):
+    except (OSError, ValueError, OverflowError):
         return False
     return True
-
-
-def check_regular(run: Path) -> None:
-    """Refuses a run directory that holds a pipe or a device, because reading it could block.
-
-    Raises:
-      ConfigError: if the directory holds a pipe or a device.
-    """
-    try:
-        found = [path for path in run.iterdir() if not (path.is_file() or path.is_dir())]
-    except OSError:  # missing, or refused later where it is read
-        return
-    odd = [path for path in found if path.exists()]  # a broken link is harmless
-    if odd:
-        raise ConfigError(f"{odd[0]} is neither a file nor a folder: remove it.")
 
 
 def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:

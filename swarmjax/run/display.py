@@ -14,7 +14,6 @@ from swarmjax import words
 Row = Mapping[str, Any]
 
 LINE_SECONDS = 2.0  # shortest time between two plain lines
-GOOD = 0.9  # a stage counts as good if it reaches a larger share of its targets
 
 
 def figures(rows: Sequence[Row], names: Sequence[str], speeds: Row) -> dict[str, str]:
@@ -44,7 +43,6 @@ def figures(rows: Sequence[Row], names: Sequence[str], speeds: Row) -> dict[str,
         "stage": first if first == final else f"{first} to {final}",
         "targets reached": cohort("success_by_stage"),
         "all robots reached": cohort("complete_by_stage"),
-        **({} if len(names) == 1 else {"stages": _stages(last, names)}),
         "targets in episodes just ended": _ratio(mine, "reached", 100, " %"),
         "contacts per robot": _ratio(mine, "contacts"),
         "return": _ratio(mine, "reward"),
@@ -69,20 +67,6 @@ def _ratio(rows: Sequence[Row], part: str, scale: float = 1.0, unit: str = "") -
     """Formats a mean over the targets of episodes that ended in a call, or `-` if none ended."""
     targets = sum(row["targets"] for row in rows)
     return f"{scale * sum(row[part] for row in rows) / targets:.3g}{unit}" if targets else "-"
-
-
-def _stages(last: Sequence[Row], names: Sequence[str]) -> str:
-    """Counts the good stages, and names the worst."""
-    columns = zip(*(row["success_by_stage"] for row in last), strict=True)
-    means: dict[str, float] = {}
-    for name, column in zip(names, columns, strict=True):
-        measured = [share for share in column if share is not None]
-        if measured:
-            means[name] = sum(measured) / len(measured)
-    good = sum(mean > GOOD for mean in means.values())
-    worst = min(means, key=lambda name: means[name], default=None)
-    text = f"{good} of {len(names)} above {100 * GOOD:.0f} %"
-    return text if worst is None else f"{text}, worst {worst} {100 * means[worst]:.1f} %"
 
 
 class Display:

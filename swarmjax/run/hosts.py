@@ -24,8 +24,8 @@ from swarmjax.run.settings import TrainConfig
 CHECKPOINTS = "checkpoints"  # folder in a run directory
 # A missing process is reported within a minute, and a lost one within half a minute.
 _JOIN_S, _HEARTBEAT_S = 45, 20
-# Keys that may differ between processes.
-_OWN = ("run.id",)
+# Keys that may differ between processes, so the comparison replaces their values.
+_OWN = {"run.id": None}
 
 
 def join(settings: TrainConfig) -> None:
@@ -182,29 +182,17 @@ def leave(code: int) -> NoReturn:
 
 def _check_alike(settings: TrainConfig) -> None:
     """Refuses processes that would run different programs."""
-    own = json.loads(json.dumps(_comparable(settings)))
+    versions = {f"version of {name}": value for name, value in provenance.versions().items()}
+    own = json.loads(json.dumps(files.flatten(to_dict(settings)) | versions | _OWN))
     theirs = json.loads(share_text(json.dumps(own)))
-    others = np.flatnonzero(share(own != theirs))
-    if not others.size:
+    if not share(own != theirs).any():
         return
-    if own == theirs:
-        raise ConfigError(
-            f"process {others[0]} has other settings or versions than process 0: give all "
-            "processes the same."
-        )
-    key = next(key for key in own if own[key] != theirs.get(key))
-    raise ConfigError(
-        f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0: give all "
-        "processes the same."
-    )
-
-
-def _comparable(settings: TrainConfig) -> dict[str, Any]:
-    """Returns the settings and versions that all processes must share, by dotted key."""
-    found = {
-        key: value for key, value in files.flatten(to_dict(settings)).items() if key not in _OWN
-    }
-    return found | {f"version of {name}": value for name, value in provenance.versions().items()}
+    other = "another process has other settings or versions"  # than this one, which is process 0
+    for key in own:
+        if own[key] != theirs.get(key):
+            other = f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0"
+            break
+    raise ConfigError(f"{other}: give all processes the same.")
 
 
 def _check_devices(settings: TrainConfig) -> None:

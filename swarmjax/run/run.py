@@ -136,8 +136,7 @@ class Run:
             yield
             return
         chosen = self._choose_path() if hosts.is_first() else Path()
-        claimed = self.settings.run.dir is None
-        with hosts.own_directory(chosen) as self.path, directory.locked(self.path, claimed=claimed):
+        with hosts.own_directory(chosen) as self.path, directory.locked(self.path):
             if hosts.is_first():  # the other processes' folders link to the first one's checkpoints
                 check_free(self.path, self.settings)
             name = self.settings.run.id or hosts.share_text(directory.new_id())
@@ -187,7 +186,6 @@ class Run:
         settings = self.settings
         if settings.resume is None or not checkpoint.steps(Path(settings.resume)):
             return None
-        directory.check_regular(Path(settings.resume))
         kept = checkpoint.find(Path(settings.resume))
         if kept.update > settings.updates:
             spent = kept.update * settings.arenas * settings.algo.rollout_length
@@ -392,7 +390,6 @@ class Run:
 
 def check_free(run: Path, settings: TrainConfig) -> None:
     """Refuses a directory that is not empty, unless it holds the run that is resumed."""
-    directory.check_regular(run)
     if settings.resume is not None and Path(settings.resume).resolve() == run.resolve():
         return
     held = directory.visible(run)

@@ -3,63 +3,41 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about
+from swarmjax.config import ConfigError, Section, setting
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
 from swarmjax.training.config import ProgramConfig
-
-# Most arenas of all seeds with run.episodes=true. With more arenas, thousands of episodes end per
-# second.
-MOST_LOGGED = 8192
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Section):
     """Where a run is written, and how often."""
 
-    id: str | None = field(
-        default=None, metadata=about("random id, drawn when the run begins", derived=True)
+    id: str | None = setting(None, "random id, drawn when the run begins", derived=True)
+    dir: str | None = setting(None, "run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
+    chunk: int | Literal["auto"] = setting(
+        "auto", "updates per call of the compiled program; auto: a second of them", 1, MAX_COUNT
     )
-    dir: str | None = field(
-        default=None, metadata=about("run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
+    checkpoint_minutes: float = setting(
+        1.0, "minutes between checkpoints; 0: after every chunk", 0.0
     )
-    chunk: int | Literal["auto"] = field(
-        default="auto",
-        metadata=about(
-            "updates per call of the compiled program; auto: a second of them", 1, MAX_COUNT
-        ),
+    keep_checkpoints: int = setting(
+        2, "how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT
     )
-    checkpoint_minutes: float = field(
-        default=1.0, metadata=about("minutes between checkpoints; 0: after every chunk", 0.0)
+    stop_after: int | None = setting(
+        None, "updates after which the run saves and stops", 0, MAX_COUNT
     )
-    keep_checkpoints: int = field(
-        default=2,
-        metadata=about("how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT),
+    tensorboard: bool = setting(True, "write TensorBoard events")
+    wandb: str | None = setting(None, "Weights & Biases project to log to; needs the extra wandb")
+    episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")
+    distributed: bool = setting(
+        False,
+        "train with other processes; Slurm, Open MPI or Kubernetes names them, or "
+        "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID",
     )
-    stop_after: int | None = field(
-        default=None,
-        metadata=about("updates after which the run saves and stops", 0, MAX_COUNT),
-    )
-    tensorboard: bool = field(default=True, metadata=about("write TensorBoard events"))
-    wandb: str | None = field(
-        default=None,
-        metadata=about("Weights & Biases project to log to; needs the extra wandb"),
-    )
-    episodes: bool = field(
-        default=False, metadata=about("write each episode, robot by robot, to episodes.jsonl")
-    )
-    distributed: bool = field(
-        default=False,
-        metadata=about(
-            "train with other processes; Slurm, Open MPI or Kubernetes names them, or "
-            "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID"
-        ),
-    )
-    deterministic: bool = field(
-        default=False, metadata=about("make results on a GPU bit-for-bit repeatable; slower")
-    )
-    dry: bool = field(default=False, metadata=about("check and describe the run; train nothing"))
+    deterministic: bool = setting(False, "make results on a GPU bit-for-bit repeatable; slower")
+    dry: bool = setting(False, "check and describe the run; train nothing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,23 +64,17 @@ class TrainConfig(ProgramConfig):
     )
 
     # `recipes.expand` replaces this word by the recipe's words, so no config holds it.
-    recipe: str | None = field(
-        default=None,
-        metadata=about("settings of a whole run, which other arguments override", stored=False),
+    recipe: str | None = setting(
+        None, "settings of a whole run, which other arguments override", stored=False
     )
     run: RunConfig = field(default_factory=RunConfig)
-    resume: str | None = field(
-        default=None,
-        metadata=about("run directory to go on with; auto: run.dir, if it holds a run"),
+    resume: str | None = setting(
+        None, "run directory to go on with; auto: run.dir, if it holds a run"
     )
-    init_from: str | None = field(
-        default=None,
-        metadata=about("run directory to take the first networks and normaliser from"),
+    init_from: str | None = setting(
+        None, "run directory to take the first networks and normaliser from"
     )
-    stage_name: str = field(
-        default="",
-        metadata=about("name of the stage or of the curriculum", derived=True),
-    )
+    stage_name: str = setting("", "name of the stage or of the curriculum", derived=True)
 
     def _check(self) -> None:
         object.__setattr__(self, "sim", make_room(self.sim, self.stage))
@@ -116,7 +88,6 @@ class TrainConfig(ProgramConfig):
         self._check_budget()
         self._check_counts()
         self._check_hearing()
-        self._check_episodes()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
             object.__setattr__(self, "streams", self.stream_count)
@@ -175,13 +146,6 @@ class TrainConfig(ProgramConfig):
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, which is enough "
                 f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: "
                 f"give at most {most}."
-            )
-
-    def _check_episodes(self) -> None:
-        if self.run.episodes and self.arenas * self.seeds > MOST_LOGGED:
-            raise ConfigError(
-                f"run.episodes is true, but arenas is {self.arenas} and seeds is {self.seeds}: "
-                f"give at most {MOST_LOGGED} arenas of all seeds together, or run.episodes=false."
             )
 
     def _check_hearing(self) -> None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from swarmjax import epuck
-from swarmjax.config import ConfigError, Section, about, inherit, show
+from swarmjax.config import ConfigError, Section, about, inherit, setting, show
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
@@ -15,38 +15,31 @@ _MOST_WEIGHT = 1e6
 NEIGHBOUR_SIZE = 4  # observation entries of a neighbour: presence, distance, cosine, sine
 
 
-def _weight(meaning: str) -> dict[str, Any]:
-    """Returns the metadata of a reward weight."""
-    return about(meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
+def _weight(default: float, meaning: str) -> Any:
+    """Returns the field of a reward weight."""
+    return setting(default, meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
     """Weights of the reward terms: equation 3 of the paper, and penalties."""
 
-    progress: float = field(default=1.0, metadata=_weight("per metre nearer to the target"))
-    path_progress: float = field(
-        default=0.0,
-        metadata=_weight("per metre nearer along the shortest path around walls and boxes"),
+    progress: float = _weight(1.0, "per metre nearer to the target")
+    path_progress: float = _weight(
+        0.0, "per metre nearer along the shortest path around walls and boxes"
     )
-    proximity: float = field(
-        default=0.0,
-        metadata=_weight("per control step before arrival with an object in infrared range"),
+    proximity: float = _weight(
+        0.0, "per control step before arrival with an object in infrared range"
     )
-    arrival: float = field(
-        default=0.0,
-        metadata=_weight("once, on arrival; with arrival=hold, when all robots have arrived"),
+    arrival: float = _weight(
+        0.0, "once, on arrival; with arrival=hold, when all robots have arrived"
     )
-    contact: float = field(default=-0.2, metadata=_weight("per contact event of any kind"))
-    touching: float = field(
-        default=0.0, metadata=_weight("per control step in which the robot touches something")
-    )
-    step_penalty: float = field(
-        default=-0.002, metadata=_weight("per control step that begins before arrival")
-    )
+    contact: float = _weight(-0.2, "per contact event of any kind")
+    touching: float = _weight(0.0, "per control step in which the robot touches something")
+    step_penalty: float = _weight(-0.002, "per control step that begins before arrival")
     extra: dict[str, float] = field(
         default_factory=ByName,
-        metadata=_weight("weights of extension terms, by name; 0: off"),
+        metadata=about("weights of extension terms, by name; 0: off", -_MOST_WEIGHT, _MOST_WEIGHT),
     )
 
 
@@ -54,7 +47,7 @@ class RewardConfig(Section):
 class NeighboursConfig(Section):
     """What a robot receives from other robots: range and bearing."""
 
-    count: int = field(default=0, metadata=about("nearest neighbours observed; 0: none", 0, 32))
+    count: int = setting(0, "nearest neighbours observed; 0: none", 0, 32)
     range: float = field(
         # AutoMoDe's reference models use a range-and-bearing board. We assume the range of that
         # board.
@@ -72,40 +65,27 @@ class NeighboursConfig(Section):
 class TaskConfig(Section):
     """What a robot is asked to do, and what it senses."""
 
-    control_step: float = field(
-        default=0.032, metadata=about("control step, s; Webots basicTimeStep", 0.001, 0.2)
+    control_step: float = setting(0.032, "control step, s; Webots basicTimeStep", 0.001, 0.2)
+    step_limit: int = setting(500, "control steps of a training episode", 1, MAX_COUNT)
+    target_radius: float = setting(
+        0.05,
+        "distance between the centres of robot and target that counts as arrival, m",
+        above=0.0,
+        high=0.1,
     )
-    step_limit: int = field(
-        default=500, metadata=about("control steps of a training episode", 1, MAX_COUNT)
+    arrival: Arrival = setting(
+        "latch",
+        "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
+        "and the episode is complete when all are within their targets at once",
     )
-    target_radius: float = field(
-        default=0.05,
-        metadata=about(
-            "distance between the centres of robot and target that counts as arrival, m",
-            above=0.0,
-            high=0.1,
-        ),
+    sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
+    encoding: Literal["auto", "metric", "webots"] = setting(
+        "auto",
+        "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
+        "realism.infrared=webots, else metric",
     )
-    arrival: Arrival = field(
-        default="latch",
-        metadata=about(
-            "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
-            "and the episode is complete when all are within their targets at once"
-        ),
-    )
-    sensor_range: float = field(
-        default=epuck.SENSOR_RANGE, metadata=about("infrared range, m", above=0.0, high=1.0)
-    )
-    encoding: Literal["auto", "metric", "webots"] = field(
-        default="auto",
-        metadata=about(
-            "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
-            "realism.infrared=webots, else metric"
-        ),
-    )
-    observations: tuple[str, ...] | None = field(
-        default=None,
-        metadata=about("observations of extensions, in order; null: all of them"),
+    observations: tuple[str, ...] | None = setting(
+        None, "observations of extensions, in order; null: all of them"
     )
     neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)

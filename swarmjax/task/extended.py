@@ -1,7 +1,7 @@
 """Runs the pieces of an extension in an arena, and checks that they fit the arena."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -12,7 +12,7 @@ from jax import Array
 from swarmjax import epuck
 from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
-from swarmjax.extension import LevelDrawing, Observation, Piece, RewardTerm
+from swarmjax.extension import LevelDrawing, Observation, Piece
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import electronics, level
 from swarmjax.task.electronics import Sight
@@ -83,22 +83,6 @@ def redraw(piece: LevelDrawing, drawn: Level) -> Level:
             "and give the stage's obstacle_size."
         )
     return found
-
-
-def earn(piece: RewardTerm, steps: Mapping[str, Any]) -> np.ndarray:
-    """Computes an extension's reward term over many control steps of one arena, in NumPy.
-
-    Args:
-      piece: the term.
-      steps: the fields of `Step`; all except `sensor_range` have a leading axis N.
-
-    Returns:
-      [N, R], not weighted.
-    """
-    reach = np.full(len(steps["distance"]), steps["sensor_range"], np.float32)
-    each = Step(**{**steps, "sensor_range": reach})
-    with explained(f"{label(piece)} fails"):
-        return np.asarray(jax.jit(jax.vmap(piece.function))(each))
 
 
 @functools.lru_cache(maxsize=16)

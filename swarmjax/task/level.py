@@ -5,7 +5,6 @@ numbers.
 """
 
 import math
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from swarmjax.task.placement import (
     lattice,
     metres,
     place,
+    poses,
     round_up,
     score_open,
     score_rectangles,
@@ -119,19 +119,19 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     drawn = _split(uniforms, spacing)
     level = _fixed(drawn, stage, spacing, xp)
     if stage.laid_out is None:  # skip the slow random placement if a layout replaces it
-        random = _random(drawn, stage, spacing, xp)
-        level = Level(*(xp.where(stage.fixed, f, r) for f, r in zip(level, random, strict=True)))
+        level = _either(stage.fixed, level, _random(drawn, stage, spacing, xp), xp)
     if stage.map is not None:
         mapped = _mapped(drawn, stage, stage.map, spacing, xp)
-        choose = partial(xp.where, stage.map.mapped)
-        level = Level(*(choose(m, other) for m, other in zip(mapped, level, strict=True)))
+        level = _either(stage.map.mapped, mapped, level, xp)
     for kind, arrays in (stage.layouts or {}).items():
-        count = drawing.uniform_count(kind, spacing.robots)
-        own = noise.uniform(level.seed, 0, Stream.LAYOUT, (count,), xp)
-        laid_out = _laid_out(kind, arrays, own, level.seed, stage, spacing, xp)
-        choose = partial(xp.where, arrays.chosen)
-        level = Level(*(choose(mine, other) for mine, other in zip(laid_out, level, strict=True)))
+        laid_out = _laid_out(kind, arrays, level.seed, stage, spacing, xp)
+        level = _either(arrays.chosen, laid_out, level, xp)
     return park(level, xp)
+
+
+def _either(is_first: Array, first: Level, second: Level, xp: Any) -> Level:
+    """Returns the first of two levels where `is_first` holds, else the second."""
+    return Level(*(xp.where(is_first, a, b) for a, b in zip(first, second, strict=True)))
 
 
 def _split(uniforms: Array, spacing: Spacing) -> _Uniforms:
@@ -146,21 +146,35 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     length = _side(stage, seed, xp)
     side = units(length, xp)
     present = xp.arange(spacing.robots) < stage.robots
-    around = centre, there, _ = _place_obstacles(drawn, stage, side, xp)
-    target = _place_targets(drawn, around, present, spacing, side, xp)
-    start = _place_starts(drawn, around, target, present, spacing, side, xp)
-    yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
+    centre, there, radius = _place_obstacles(drawn, stage, side, xp)
+    hull, reach = spacing.hull_radius, spacing.target_radius
+    apart, from_target, start_apart = gaps_of(hull, reach)
+    clear = clearance(hull)
+
+    def score(points: Array, beside: Gap) -> Array:
+        obstacles = score_things(points, centre, there, beside, xp)
+        return xp.minimum(score_walls(points, side, clear, xp), obstacles)
+
+    points = lattice(drawn.target_shift, side, xp)
+    # One robot parks on this side of its target while another one passes behind it.
+    behind = radius + round_up(reach + 3.0 * hull)
+    free = score(points, Gap(radius + clear, behind))
+    target, _ = place(points, free, drawn.target, present, apart, xp)
+    points = lattice(drawn.start_shift, side, xp)
+    # No robot starts where another one may be parked.
+    unparked = score_things(points, target, present, from_target, xp)
+    free = xp.minimum(score(points, Gap(radius + clear, radius + clear)), unparked)
+    start, _ = place(points, free, drawn.start, present, start_apart, xp)
     turn = drawn.obstacle_yaw * np.float32(0.5 * math.pi)
     half = 0.5 * stage.obstacle_size * xp.ones_like(turn)
+    shape = xp.stack([turn, half, half], axis=-1)
     return Level(
         side=length,
         present=present,
-        start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
+        start=poses(start, drawn.heading, xp),
         target=metres(target, xp),
         obstacle_present=there,
-        obstacle=xp.concatenate(
-            [metres(centre, xp), xp.stack([turn, half, half], axis=-1)], axis=-1
-        ),
+        obstacle=xp.concatenate([metres(centre, xp), shape], axis=-1),
         seed=seed,
     )
 
@@ -200,51 +214,6 @@ def _place_obstacles(
     return centre, there, radius
 
 
-def _place_targets(
-    drawn: _Uniforms,
-    around: tuple[Array, Array, Array],
-    present: Array,
-    spacing: Spacing,
-    side: Array,
-    xp: Any,
-) -> Array:
-    """Places targets so that parked robots leave a way through; returns [R, 2] units."""
-    hull, reach = spacing.hull_radius, spacing.target_radius
-    centre, there, radius = around
-    beside = Gap(
-        radius + clearance(hull),
-        # One robot parks on this side of its target while another one passes behind it.
-        radius + round_up(reach + 3.0 * hull),
-    )
-    apart = gaps_of(hull, reach).target
-    points = lattice(drawn.target_shift, side, xp)
-    score = score_walls(points, side, clearance(hull), xp)
-    score = xp.minimum(score, score_things(points, centre, there, beside, xp))
-    return place(points, score, drawn.target, present, apart, xp)[0]
-
-
-def _place_starts(
-    drawn: _Uniforms,
-    around: tuple[Array, Array, Array],
-    target: Array,
-    present: Array,
-    spacing: Spacing,
-    side: Array,
-    xp: Any,
-) -> Array:
-    """Places starts clear of obstacles, targets and robots parked at targets; [R, 2] units."""
-    hull, reach = spacing.hull_radius, spacing.target_radius
-    centre, there, radius = around
-    beside = clearance(hull) + radius
-    _, from_target, apart = gaps_of(hull, reach)
-    points = lattice(drawn.start_shift, side, xp)
-    score = score_walls(points, side, clearance(hull), xp)
-    walled = score_things(points, centre, there, Gap(beside, beside), xp)
-    clear = score_things(points, target, present, from_target, xp)
-    score = xp.minimum(score, xp.minimum(walled, clear))
-    return place(points, score, drawn.start, present, apart, xp)[0]
-
-
 def _fixed(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Returns the paper's level, scaled with the arena; only its seed is random."""
     count = xp.where(stage.fence, xp.minimum(stage.obstacles, 1), stage.obstacles)
@@ -264,9 +233,15 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
     present = xp.arange(spacing.robots) < stage.robots
     paired = present & (xp.arange(spacing.robots) < arena.pairs)
     pair = _rows(arena.pair, spacing.robots, xp)
-    hull, reach = spacing.hull_radius, spacing.target_radius
-    score = partial(_score_on_map, stage, arena, spacing, xp)
-    target_apart, from_target, start_apart = gaps_of(hull, reach)
+    apart, from_target, start_apart = gaps_of(spacing.hull_radius, spacing.target_radius)
+    clear, side = clearance(spacing.hull_radius), units(stage.side, xp)
+    walls = units(arena.wall[:, np.array([0, 1, 3, 4])], xp)
+    walled = xp.arange(arena.wall.shape[0]) < stage.obstacles
+
+    def score(points: Array, is_open: Array) -> Array:
+        beside = score_rectangles(points, walls, walled, clear, xp)
+        within = score_walls(points, side, clear, xp)
+        return xp.minimum(score_open(points, is_open, xp), xp.minimum(beside, within))
 
     def place_others(points: Array, score: Array, fixed: Array, gap: Gap, picks: Array) -> Array:
         score = xp.minimum(score, score_things(points, fixed, paired, gap, xp))
@@ -274,17 +249,16 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
         return xp.where(paired[:, None], fixed, placed)
 
     free = score(arena.target, arena.target_open)
-    target = place_others(arena.target, free, pair[:, 1], target_apart, drawn.target)
-    clear = score_things(arena.start, target, present, from_target, xp)
-    free = xp.minimum(score(arena.start, arena.start_open), clear)
+    target = place_others(arena.target, free, pair[:, 1], apart, drawn.target)
+    unparked = score_things(arena.start, target, present, from_target, xp)
+    free = xp.minimum(score(arena.start, arena.start_open), unparked)
     start = place_others(arena.start, free, pair[:, 0], start_apart, drawn.start)
-    yaw = (drawn.heading * 2.0 - 1.0) * np.float32(math.pi)
     wall = _rows(arena.wall, spacing.obstacles, xp)
     there = xp.arange(spacing.obstacles) < stage.obstacles
     return Level(
         side=stage.side,
         present=present,
-        start=xp.concatenate([metres(start, xp), yaw[:, None]], axis=-1),
+        start=poses(start, drawn.heading, xp),
         target=metres(target, xp),
         obstacle_present=there,
         obstacle=xp.where(there[:, None], wall, np.float32(0.5) * stage.obstacle_size),
@@ -293,42 +267,25 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
 
 
 def _laid_out(
-    kind: Kind,
-    of: LayoutArrays,
-    uniforms: Array,
-    seed: Array,
-    stage: Stage,
-    spacing: Spacing,
-    xp: Any,
+    kind: Kind, of: LayoutArrays, seed: Array, stage: Stage, spacing: Spacing, xp: Any
 ) -> Level:
     """Lays out an arena. Robots and walls that the layout does not have are absent."""
     present = xp.arange(spacing.robots) < stage.robots
+    count = drawing.uniform_count(kind, spacing.robots)
+    uniforms = noise.uniform(seed, 0, Stream.LAYOUT, (count,), xp)
     hull, reach = spacing.hull_radius, spacing.target_radius
-    arena = drawing.draw(kind, of, uniforms, present, hull, reach, xp)
-    walls, count = len(arena.obstacle), spacing.obstacles
+    side, drawn = drawing.draw(kind, of, uniforms, present, hull, reach, xp)
     absent = xp.stack([xp.zeros_like(stage.obstacle_size)] * 3 + [0.5 * stage.obstacle_size] * 2)
-    mine = np.arange(count)[:, None] < walls
+    mine = np.arange(spacing.obstacles)[:, None] < len(drawn.wall)
     return Level(
-        side=arena.side,
+        side=side,
         present=present,
-        start=arena.start,
-        target=arena.target,
-        obstacle_present=_rows(arena.obstacle_present, count, xp),
-        obstacle=xp.where(mine, _rows(arena.obstacle, count, xp), absent),
+        start=drawn.start,
+        target=drawn.target,
+        obstacle_present=_rows(drawn.there, spacing.obstacles, xp),
+        obstacle=xp.where(mine, _rows(drawn.wall, spacing.obstacles, xp), absent),
         seed=seed,
     )
-
-
-def _score_on_map(
-    stage: Stage, arena: MapArrays, spacing: Spacing, xp: Any, points: Array, is_open: Array
-) -> Array:
-    """Scores the points [P] of an area by whether a robot fits there."""
-    gap = clearance(spacing.hull_radius)
-    there = xp.arange(arena.wall.shape[0]) < stage.obstacles
-    rectangle = units(arena.wall[:, np.array([0, 1, 3, 4])], xp)
-    beside = score_rectangles(points, rectangle, there, gap, xp)
-    within = score_walls(points, units(stage.side, xp), gap, xp)
-    return xp.minimum(score_open(points, is_open, xp), xp.minimum(beside, within))
 
 
 def _rows(array: Array, count: int, xp: Any) -> Array:

@@ -82,6 +82,12 @@ def metres(units: Array, xp: Any) -> Array:
     return units.astype(xp.float32) / UNITS
 
 
+def poses(place: Array, heading: Array, xp: Any) -> Array:
+    """Returns poses [R, 3] (m, rad) at places [R, 2] (units); `heading` is [R] in [0, 1)."""
+    yaw = (heading * 2.0 - 1.0) * np.float32(math.pi)
+    return xp.concatenate([metres(place, xp), yaw[:, None]], axis=-1)
+
+
 def split(uniforms: Array, counts: Sequence[int]) -> list[Array]:
     """Splits uniform numbers into parts of the given lengths."""
     ends = np.cumsum(counts)

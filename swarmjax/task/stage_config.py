@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from swarmjax.config import ConfigError, Section, about, section, show
+from swarmjax.config import ConfigError, Section, about, section, setting, show
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import fixed_level, maps
 from swarmjax.task.layouts import LAYOUTS
 from swarmjax.task.layouts.drawing import Kind
-from swarmjax.task.layouts.site import NUMBERS, ArenaLayout, Demand
+from swarmjax.task.layouts.site import NUMBERS, ArenaLayout
 from swarmjax.task.placement import UNITS
 
 # Area that a random level needs. A start and a target each take a square of 0.15 m (two hulls of
@@ -68,11 +68,6 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     return found
 
 
-def _length(meaning: str, low: float, high: float) -> dict[str, Any]:
-    """Returns the metadata of a layout's length."""
-    return about(f"{meaning}, m, or a range", low, high)
-
-
 @dataclass(frozen=True, kw_only=True)
 class StageConfig(Section):
     """One stage: number of robots, arena size and obstacles."""
@@ -82,52 +77,37 @@ class StageConfig(Section):
     side: float | tuple[float, float] = field(
         metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
-    obstacles: int = field(
-        default=0, metadata=about("obstacles; set by a layout", 0, _MOST_OBSTACLES)
+    obstacles: int = setting(0, "obstacles; set by a layout", 0, _MOST_OBSTACLES)
+    obstacle_size: float = setting(0.10, "edge of the square boxes of a random level, m", 0.02, 0.3)
+    level: str = setting(
+        "random",
+        "random: new in every episode; fixed: always the same; map: the walls of map, with "
+        f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
+        "of an extension's level drawing",
     )
-    obstacle_size: float = field(
-        default=0.10, metadata=about("edge of the square boxes of a random level, m", 0.02, 0.3)
+    layout: Literal["boxes", "fence"] = setting("boxes", "obstacles of a fixed level")
+    map: tuple[str, ...] = setting(
+        (),
+        "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
+        "its capital for one robot; sets side, obstacles and level",
     )
-    level: str = field(
-        default="random",
-        metadata=about(
-            "random: new in every episode; fixed: always the same; map: the walls of map, with "
-            f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
-            "of an extension's level drawing"
-        ),
+    cell: float = setting(0.12, "edge of a map cell, m", _SMALLEST_CELL, 1.0)
+    breadth: _Length = setting(
+        None, "breadth of a layout's arena (null: as long as side), m, or a range", 0.2, 4.0
     )
-    layout: Literal["boxes", "fence"] = field(
-        default="boxes", metadata=about("obstacles of a fixed level")
+    gap: _Length = setting(
+        None, "free width of a door or a corridor, m, or a range", _SMALLEST_CELL, 1.0
     )
-    map: tuple[str, ...] = field(
-        default=(),
-        metadata=about(
-            "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
-            "its capital for one robot; sets side, obstacles and level"
-        ),
+    width: _Length = setting(
+        None, "free width of a trap, or of a corridor at its bay, m, or a range", 0.1, 2.0
     )
-    cell: float = field(default=0.12, metadata=about("edge of a map cell, m", _SMALLEST_CELL, 1.0))
-    breadth: _Length = field(
-        default=None,
-        metadata=_length("breadth of a layout's arena (null: as long as side)", 0.2, 4.0),
+    depth: _Length = setting(None, "depth of a trap, m, or a range", 0.05, 2.0)
+    length: _Length = setting(None, "length of a fence or a bay, m, or a range", 0.1, 4.0)
+    radius: _Length = setting(None, "radius of the circle of starts, m, or a range", 0.1, 1.9)
+    apart: _Length = setting(
+        None, "distance between targets, or from targets to a door, m, or a range", 0.05, 1
     )
-    gap: _Length = field(
-        default=None, metadata=_length("free width of a door or a corridor", _SMALLEST_CELL, 1.0)
-    )
-    width: _Length = field(
-        default=None,
-        metadata=_length("free width of a trap, or of a corridor at its bay", 0.1, 2.0),
-    )
-    depth: _Length = field(default=None, metadata=_length("depth of a trap", 0.05, 2.0))
-    length: _Length = field(default=None, metadata=_length("length of a fence or a bay", 0.1, 4.0))
-    radius: _Length = field(
-        default=None, metadata=_length("radius of the circle of starts", 0.1, 1.9)
-    )
-    apart: _Length = field(
-        default=None,
-        metadata=_length("distance between targets, or from targets to a door", 0.05, 1),
-    )
-    cells: int | None = field(default=None, metadata=about("cells along a maze's side", 2, 6))
+    cells: int | None = setting(None, "cells along a maze's side", 2, 6)
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
@@ -153,8 +133,6 @@ class StageConfig(Section):
     def _check_fixed(self) -> None:
         if self.layout == "fence" and self.level != "fixed":
             raise ConfigError(f"layout is fence, but level is {self.level}: give level=fixed.")
-        if self.layout == "fence" and self.obstacles < 1:
-            raise ConfigError("obstacles is 0, but layout is fence: give 1 or more.")
         if self.level != "fixed":
             return
         if isinstance(self.side, tuple):
@@ -209,9 +187,9 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
-        numbers = {key: _ends(getattr(self, key)) for key in layout.reads}
+        numbers = {key: _ends(getattr(self, key))[1] for key in layout.reads}
         sizes = {"side": self.sides[0], "breadth": _ends(self.breadth or self.side)[0]}
-        demand = Demand(self.robots, sizes["side"], sizes["breadth"], numbers)
+        demand = {"robots": self.robots, **sizes, **numbers}
         for (key, found), least in zip(sizes.items(), layout.least(demand), strict=True):
             if found < least - 1e-9:
                 with_ = " ".join(f"{key}={show(getattr(self, key))}" for key in layout.reads)
@@ -322,25 +300,18 @@ class GridConfig(Section):
     """A grid of stages: all combinations of numbers of robots, numbers of obstacles and sides."""
 
     robots: tuple[int, ...] = field(metadata=about("active robots", 1, 100))
-    obstacles: tuple[int, ...] = field(
-        default=(0,), metadata=about("obstacles", 0, _MOST_OBSTACLES)
-    )
+    obstacles: tuple[int, ...] = setting((0,), "obstacles", 0, _MOST_OBSTACLES)
     side: tuple[float | tuple[float, float], ...] = field(
         metadata=about("sides of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
-    obstacle_size: float = field(
-        default=0.10, metadata=about("edge of the square boxes, m", 0.02, 0.3)
-    )
+    obstacle_size: float = setting(0.10, "edge of the square boxes, m", 0.02, 0.3)
 
     def _check(self) -> None:
-        for key in ("robots", "obstacles", "side"):
-            if not getattr(self, key):
-                raise ConfigError(f"{key} is []: give at least one number.")
         if not self.stages():
-            least = _smallest_side(min(self.robots), min(self.obstacles), self.obstacle_size)
             raise ConfigError(
-                f"side is {show(self.side)}, too small for every cell of the grid: even the fewest "
-                f"robots and obstacles need {math.ceil(100 * least) / 100}."
+                f"side is {show(self.side)}, which no cell of the grid fits with robots="
+                f"{show(self.robots)} and obstacles={show(self.obstacles)}: give at least one "
+                "number of each, and larger sides."
             )
 
     def stages(self) -> tuple[StageConfig, ...]:

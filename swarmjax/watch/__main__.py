@@ -1,7 +1,7 @@
 """`python -m swarmjax.watch run=DIR [port=N]`: serves a page on this machine that follows a run.
 
 Prints the page's address, and serves it until Ctrl-C. The page shows whether the run trains, has
-ended or was killed. The page needs no account, and sends nothing off the machine.
+ended or has stopped early. It needs no account, and sends nothing off the machine.
 
 Examples:
   # serve a page on this machine, and print its address
@@ -27,6 +27,7 @@ def main(arguments: Sequence[str]) -> int:
     from swarmjax.watch.view import Views
 
     views = Views(settings)
+    views.draw()
     with Server(settings.port, views) as server:
         views.follow()
         sys.stdout.write(f"{server.url} follows {settings.run}; Ctrl-C ends it.\n")

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from swarmjax.config import Section, about
+from swarmjax.config import Section, about, setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,13 +13,9 @@ class WatchConfig(Section):
     command: ClassVar[str] = "watch"
 
     run: str = field(metadata=about("run directory"))
-    port: int = field(
-        default=0, metadata=about("port of the page, on 127.0.0.1; 0: any free port", 0, 2**16 - 1)
-    )
-    extensions: str | None = field(
-        default=None,
-        metadata=about(
-            "Python file with the pieces that the run was trained with; it is executed; "
-            "null: a policy that needs such pieces is not replayed"
-        ),
+    port: int = setting(0, "port of the page, on 127.0.0.1; 0: any free port", 0, 2**16 - 1)
+    extensions: str | None = setting(
+        None,
+        "Python file with the pieces that the run was trained with; it is executed; "
+        "null: a policy that needs such pieces is not replayed",
     )

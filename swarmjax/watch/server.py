@@ -6,11 +6,8 @@ Host and are refused. Without rebinding it cannot read answers either, since no 
 another origin.
 """
 
-import contextlib
 import json
-import socket
 import sys
-import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -28,9 +25,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-# A browser's answers take milliseconds. A connection that lasts longer is closed, also if it sends.
-_TIMEOUT_S = 10.0
-_MOST = 32  # connections at once; a browser opens six
+_SILENT_S = 10.0  # a connection that sends nothing for this long is closed
 
 
 class Server(ThreadingHTTPServer):
@@ -52,7 +47,6 @@ class Server(ThreadingHTTPServer):
             sources=_SOURCES,
             title=f"Watching {views.run}",
         )
-        self._begun: dict[socket.socket, float] = {}
         try:
             super().__init__((ADDRESS, port), Answers)
         except OSError as error:
@@ -60,26 +54,6 @@ class Server(ThreadingHTTPServer):
                 f"port is {port}, which is not available ({error.strerror}): give another, or 0 "
                 "for any free port."
             ) from None
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answers a connection in a thread, or closes it if there are too many."""
-        if len(self._begun) >= _MOST:
-            self.shutdown_request(request)
-            return
-        self._begun[request] = time.monotonic()
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Closes a connection."""
-        self._begun.pop(request, None)
-        super().shutdown_request(request)
-
-    def service_actions(self) -> None:
-        """Ends connections that last too long. `serve_forever` calls this twice a second."""
-        for request, began in list(self._begun.items()):
-            if time.monotonic() - began > _TIMEOUT_S:
-                with contextlib.suppress(OSError):
-                    request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignores a browser that has closed the connection before it received its answer."""
@@ -102,7 +76,7 @@ class Answers(BaseHTTPRequestHandler):
 
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version, sys_version = "swarmjax", ""
-    timeout = _TIMEOUT_S
+    timeout = _SILENT_S
 
     def do_GET(self) -> None:  # the name that the library calls; it refuses other methods
         """Answers with the content at a path."""

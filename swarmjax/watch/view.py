@@ -11,7 +11,7 @@ from swarmjax.policy import PolicyError
 from swarmjax.report import page as report_page
 from swarmjax.report import rows
 from swarmjax.report.rows import History
-from swarmjax.run.directory import METRICS, check_regular
+from swarmjax.run.directory import METRICS
 from swarmjax.run.errors import CheckpointError
 from swarmjax.watch import newest, status
 from swarmjax.watch.config import WatchConfig
@@ -44,7 +44,6 @@ class Views:
           ConfigError: if there is no valid config.
         """
         self.settings, self.run = settings, Path(settings.run)
-        check_regular(self.run)
         self.trained = rows.read_config(self.run)
         self.history: History | None = None
         self.figures: dict[str, bytes] = {}
@@ -62,7 +61,7 @@ class Views:
     def state(self) -> dict[str, Any]:
         """Returns the page's current content as plain data, and marks the page as open."""
         self._asked = time.monotonic()
-        now = status.read(self.run, self.trained)
+        now = status.read(self.run, self.trained, self.history)
         return {
             **now._asdict(),
             "facts": [] if self.history is None else report_page.facts(self.history),
@@ -80,7 +79,6 @@ class Views:
 
         began = time.perf_counter()
         try:
-            check_regular(self.run)
             self.history = rows.read(self.run)
             self.figures = figures.png_files(self.history)
             self.drawing = {"version": self.drawing["version"] + 1, "trouble": ""}

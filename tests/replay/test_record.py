@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import extensions
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,7 @@ import replays
 import steering
 from sentences import refusal
 
-from swarmjax import extension, policy_file
+from swarmjax import policy_file
 from swarmjax.evaluate import cells, engine_c
 from swarmjax.replay import record as replay_record
 from swarmjax.replay.config import ReplayConfig
@@ -106,53 +105,6 @@ def test_progress_along_paths_is_that_of_training(steer):
         atol=1e-5,  # sums of 100 float32
     )
     assert (recording.arrival == 0).any()
-
-
-def _with_terms(tmp_path: Path, body: str) -> tuple[Path, str]:
-    """Writes an extension's reward terms, and a policy trained with them that spins on the spot."""
-    file = extensions.write(tmp_path / "own.py", body)
-    terms = {piece.name: piece for piece in extension.load(file).rewards}
-    policy = steering.write(
-        tmp_path / "spin.npz",
-        steering.SPIN,
-        extensions={"reward": {name: piece.digest for name, piece in terms.items()}},
-        config={"task": {"reward": {"extra": dict.fromkeys(terms, 2.0)}}},
-    )
-    return policy, file
-
-
-def test_terms_of_an_extension_are_those_of_the_steps(tmp_path):
-    policy, file = _with_terms(
-        tmp_path,
-        """
-@reward_term(weight=1.0)
-def turned(step):
-    return step.pose[:, 2] - step.pose_before[:, 2]
-
-@reward_term(weight=1.0)
-def commanded(step):
-    return step.action[:, 1] + jnp.where(step.present, step.clock, 0)
-""",
-    )
-    words = [*replays.SMALL, "level=2", "steps=9", f"extensions={file}"]
-    _, (recording,) = replays.recorded(policy, *words)
-    turn = np.diff(recording.pose[..., 2], axis=0)
-    # The term gets yaws of up to pi in float32.
-    np.testing.assert_allclose(recording.reward["turned"][1:], 2.0 * turn, atol=2e-6)
-    # The policy commands a turn of 1; the clock counts from 1.
-    expected = 2.0 * (1.0 + np.arange(1, 10))[:, None].repeat(3, axis=1)
-    np.testing.assert_allclose(recording.reward["commanded"][1:], expected, rtol=1e-6)
-    np.testing.assert_array_equal(recording.reward["commanded"][0], 0.0)
-
-
-def test_a_term_that_has_changed_is_left_out(tmp_path):
-    body = "@reward_term(weight=1.0)\ndef turned(step):\n    return step.action[:, 1]\n"
-    policy, file = _with_terms(tmp_path, body)
-    Path(file).write_text(Path(file).read_text().replace("[:, 1]", "[:, 0]"))
-    _, (recording,) = replays.recorded(
-        policy, *replays.SMALL, "level=2", "steps=2", f"extensions={file}"
-    )
-    assert "turned" not in recording.reward
 
 
 def test_a_recording_ends_when_all_have_arrived(steer):

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,8 +17,6 @@ from swarmjax.config import ConfigError
 from swarmjax.run import directory
 from swarmjax.run.directory import Log
 from swarmjax.run.errors import CheckpointError
-from swarmjax.run.load_settings import load_train
-from swarmjax.run.run import check_free
 
 # A program that holds the lock of a directory until it is killed.
 _HOLDER = """
@@ -49,12 +46,6 @@ def test_a_second_process_is_refused_until_the_first_is_dead(tmp_path: Path) -> 
         assert run.exists()
 
 
-def test_a_run_that_wrote_nothing_leaves_no_directory(tmp_path: Path) -> None:
-    with directory.locked(tmp_path / "a" / "b"):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_starts_of_the_same_second_get_directories_of_their_own(tmp_path: Path) -> None:
     def claim(_: int) -> str:
         return directory.claim(tmp_path / "runs", "now").name
@@ -62,19 +53,6 @@ def test_starts_of_the_same_second_get_directories_of_their_own(tmp_path: Path) 
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(claim, range(20)))
     assert sorted(found) == sorted(["now", *(f"now-{number}" for number in range(2, 21))])
-
-
-def test_a_claimed_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
-    run = directory.claim(tmp_path, "now")
-    with directory.locked(run, claimed=True):
-        pass
-    assert not run.exists()
-
-
-def test_a_directory_that_was_there_stays(tmp_path: Path) -> None:
-    with directory.locked(tmp_path):
-        pass
-    assert tmp_path.exists()
 
 
 def _write(path: Path, *rows: dict) -> int:
@@ -191,27 +169,3 @@ def test_a_file_system_without_locks_is_named(
     refused = pytest.raises(ConfigError, match="cannot be written: No locks available")
     with refused, directory.locked(tmp_path):
         pass
-
-
-def test_a_lock_file_that_was_removed_meanwhile_is_opened_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock, path, removed = fcntl.flock, tmp_path / directory.LOCK, []
-
-    def remove_first(file: Any, how: int) -> None:
-        if not removed:  # like a process that held the lock and wrote nothing
-            removed.append(path.unlink())
-        lock(file, how)
-
-    monkeypatch.setattr(fcntl, "flock", remove_first)
-    with directory.locked(tmp_path):
-        monkeypatch.undo()
-        with pytest.raises(ConfigError, match="is writing"), directory.locked(tmp_path):
-            pass
-
-
-@pytest.mark.parametrize("name", ["metrics.jsonl", "summary.json", "config.json"])
-def test_a_pipe_in_a_run_directory_is_refused(name: str, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / name)
-    with pytest.raises(ConfigError, match=f"{name} is neither a file nor a folder: remove it"):
-        check_free(tmp_path, load_train(["stage=s1"]))

@@ -47,7 +47,6 @@ def test_a_cohort_says_how_good_the_swarm_is() -> None:
     assert found["targets reached"] == "25.0 %"
     assert found["all robots reached"] == "12.5 %"
     assert found["targets in episodes just ended"] == "75 %"
-    assert found["stages"] == "1 of 3 above 90 %, worst s2 25.0 %"
     assert found["arena steps/s"] == "1,000"
 
 
@@ -65,19 +64,12 @@ def test_several_seeds_are_shown_with_their_range() -> None:
     found = figures([ROW, two], NAMES, SPEEDS)
     assert found["targets reached"] == "50.0 % (25 to 75)"
     assert found["targets in episodes just ended"] == "50 %"
-    # The mean of 0.95 and 0.85 is 0.9, up to rounding, and 0.9 is not above 90 %.
-    assert found["stages"] == "0 of 3 above 90 %, worst s2 50.0 %"
     assert figures([ROW, OTHER], NAMES, SPEEDS)["stage"] == "s2 to s3"
 
 
 def test_what_no_cohort_has_measured_is_said() -> None:
     assert figures([OTHER], NAMES, SPEEDS)["targets reached"] == "not measured yet"
     assert spread([None, 0.25]) == "25.0 %"
-
-
-def test_a_single_stage_has_no_line_about_stages() -> None:
-    row = ROW | {"stage": "s1", "success_by_stage": [0.0], "complete_by_stage": [0.0]}
-    assert "stages" not in figures([row], ["s1"], SPEEDS)
 
 
 def _shown(terminal: bool) -> str:

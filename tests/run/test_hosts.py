@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from sentences import refusal
 
 from swarmjax.run import hosts
 from swarmjax.run.load_settings import load_train
@@ -54,7 +55,7 @@ def test_processes_of_other_settings_are_refused(tmp_path: Path, coordinator: st
     both = [_start(run, coordinator, i, "devices=2", f"seed={i}") for i in range(2)]
     (first, said), (second, named) = map(_said, both)
     assert (first, second) == (2, 2)
-    assert "process 1 has other settings" in said
+    assert "another process has other settings" in said
     assert "seed is 1 here and 0 in process 0" in named
     assert "Traceback" not in said + named
     assert not run.exists()
@@ -83,9 +84,11 @@ def test_a_process_whose_peer_never_comes_is_refused_in_time(
 
 
 def test_processes_of_other_versions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = load_train(["seed=1"])
-    monkeypatch.setattr(hosts.provenance, "versions", lambda: {"jax": "0.0.1"})
-    assert hosts._comparable(settings)["version of jax"] == "0.0.1"
+    other = {"version of jax": "0.0.1"}
+    monkeypatch.setattr(hosts, "share_text", lambda text: json.dumps(json.loads(text) | other))
+    sentence = refusal(hosts._check_alike, load_train(["seed=1"]))
+    assert sentence.startswith("version of jax is ")
+    assert sentence.endswith("and '0.0.1' in process 0: give all processes the same.")
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 from swarmjax import train
 from swarmjax.config import ConfigError
-from swarmjax.run import compiled, memory
+from swarmjax.run import compiled, directory, memory
 from swarmjax.run import run as runs
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
@@ -116,7 +116,7 @@ def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
         monkeypatch.setattr(runs.Run, each, lambda *_: pytest.fail("nothing to do"))
     with pytest.raises(ConfigError, match=r"^arenas is 1048576, but its state alone needs "):
         train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
-    assert not (tmp_path / "run").exists()
+    assert directory.visible(tmp_path / "run") == []
 
 
 def test_an_absurd_number_is_refused_by_the_config() -> None:
@@ -137,4 +137,4 @@ def test_a_program_too_large_is_refused_before_anything_is_written(
             ConfigError, match=r"^arenas is 64, but training needs 2 GiB of .*56\.$"
         ):
             train.main([*WORDS, "arenas=64", f"run.dir={run}", *words])
-    assert not run.exists()
+    assert directory.visible(run) == []

@@ -170,8 +170,6 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
          "level=fixed."),
-        (["stage=s1", "stage.level=fixed", "stage.layout=fence"], "stage.obstacles is 0, but "
-         "layout is fence: give 1 or more."),
         # Types and bounds.
         (["task.arrival=stay"], "task.arrival is 'stay': give latch or hold."),
         (["task=3"], "task is 3: give its keys, such as task.control_step."),
@@ -215,8 +213,9 @@ def test_import_needs_neither_jax_nor_hydra():
         # Grids.
         (["stage=grid", "stage.side=1"], "stage.side cannot be given for grid, a grid: give its "
          "axes, as in stage.grid.side=[0.7,1.0]."),
-        (["stage=grid", "stage.grid.robots=[]"], "stage.grid.robots is []: give at least one "
-         "number."),
+        (["stage=grid", "stage.grid.robots=[]", "stage.grid.side=[1]"], "stage.grid.side is [1], "
+         "which no cell of the grid fits with robots=[] and obstacles=[0,1,2,3]: give at least one "
+         "number of each, and larger sides."),
         (["stage=grid", "stage.grid.robots=[2,6]", "sim.max_robots=5"], "stage r6-o0-s70: robots "
          "is 6, but sim.max_robots is 5: give 1 to 5."),
         (["stage=grid", "stage.grid.robot=[2]"], "stage.grid.robot is not a key: did you mean "
@@ -229,10 +228,10 @@ def test_import_needs_neither_jax_nor_hydra():
          "lower number first."),
         (["stage=grid", "stage.grid.side=[1,1]"], "stage names r2-o0-s100 more than once: give "
          "each stage once."),
-        # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743.
+        # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743 m.
         (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
-         "is [0.4,0.5], too small for every cell of the grid: even the fewest robots and obstacles "
-         "need 0.58."),
+         "is [0.4,0.5], which no cell of the grid fits with robots=[5] and obstacles=[0,1,2,3]: "
+         "give at least one number of each, and larger sides."),
         (["stage.sequence=[s1,grid]"], "stage.sequence is grid, which names several stages: "
          "give single stages."),
         # Checks across keys.

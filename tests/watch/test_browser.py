@@ -26,7 +26,7 @@ TRAINED = replace(CONFIG, seeds=2, run=RunConfig(id="0123456789abcdef"))
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
-    """Returns the views of a killed run of two seeds, whose directory's name is an HTML tag."""
+    """Returns the views of a stopped run of two seeds, whose directory's name is an HTML tag."""
     rows = [row(update, seed) for update in range(TRAINED.updates - 1) for seed in (0, 1)]
     run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
     begun = Run(TRAINED)
@@ -76,7 +76,7 @@ def test_the_page_follows_a_run_and_asks_nobody_else(browser: Any, server: Serve
     drawn = "return document.querySelectorAll('figure:not([hidden])').length"
     wait.until(lambda _: browser.execute_script(drawn) == 2)
     status = browser.find_element("id", "status")
-    assert status.text.startswith("It was killed, or broke, after 19 of 20 updates. ")
+    assert status.text.startswith("It has stopped after 19 of 20 updates. ")
     assert "seeds\n0 to 1" in browser.find_element("id", "facts").text
     assert "by the policy of seed 0" in browser.find_element("id", "seen").text
     browser.switch_to.frame("replay")

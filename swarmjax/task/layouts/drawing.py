@@ -1,6 +1,5 @@
 """Draws levels of layouts: draws numbers, lays out an arena, turns it, converts it to metres."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -8,30 +7,12 @@ import numpy as np
 
 from swarmjax.task.layouts import LAYOUTS
 from swarmjax.task.layouts.site import NUMBERS, Drawn, Numbers, Site, between, pick, rows
-from swarmjax.task.placement import clearance, gaps_of, metres, round_up, split
+from swarmjax.task.placement import clearance, gaps_of, metres, poses, round_up, split
 
 Array = Any
 _TURNS = 8  # quarter turns, and their mirror images
 LENGTHS = 2 + len(NUMBERS)  # lengths of a level: extents along x and y, and `NUMBERS`
 _BARS = 2  # walls that make an arena narrower than it is long
-
-
-class LaidOut(NamedTuple):
-    """A laid-out arena, which replaces all of these fields of a level.
-
-    Attributes:
-      side: [] m.
-      start: [R, 3] x (m), y (m), yaw (rad).
-      target: [R, 2] m.
-      obstacle_present: [W] whether the wall is present.
-      obstacle: [W, 5] x (m), y (m), yaw (0 rad), half edges (m).
-    """
-
-    side: Array
-    start: Array
-    target: Array
-    obstacle_present: Array
-    obstacle: Array
 
 
 class LayoutArrays(NamedTuple):
@@ -106,7 +87,7 @@ def draw(
     hull: float,
     reach: float,
     xp: Any,
-) -> LaidOut:
+) -> tuple[Array, Drawn]:
     """Lays an arena out.
 
     Args:
@@ -119,7 +100,9 @@ def draw(
       xp: `numpy` or `jax.numpy`; both draw the same arena.
 
     Returns:
-      The arena: a square, in which bars of wall enclose a narrower arena.
+      The side of the arena, m, and its layout: walls [W, 5] x (m), y (m), yaw (0 rad) and half
+      edges (m), starts [R, 3] x (m), y (m), yaw (rad), and targets [R, 2] (m). The arena is a
+      square, in which bars of wall enclose a narrower arena.
     """
     layout, count = LAYOUTS[kind.name], present.shape[0]
     own = layout.uniforms(count, kind.cells)
@@ -139,15 +122,12 @@ def draw(
     drawn = layout.draw(rest, site, xp)
     drawn = _with_bars(drawn, half, xp) if kind.narrow else drawn
     drawn = _turned(drawn, pick(turn[0], xp.int32(0), xp.int32(_TURNS - 1), xp), xp)
-    yaw = (heading * 2.0 - 1.0) * np.float32(math.pi)
     wall = metres(drawn.wall, xp)
     level = xp.zeros_like(wall[:, :1])
-    return LaidOut(
-        side=metres(xp.maximum(side, breadth), xp),
-        start=xp.concatenate([metres(drawn.start, xp), yaw[:, None]], axis=-1),
+    return metres(xp.maximum(side, breadth), xp), drawn._replace(
+        wall=xp.concatenate([wall[:, :2], level, wall[:, 2:]], axis=-1),
+        start=poses(drawn.start, heading, xp),
         target=metres(drawn.target, xp),
-        obstacle_present=drawn.there,
-        obstacle=xp.concatenate([wall[:, :2], level, wall[:, 2:]], axis=-1),
     )
 
 

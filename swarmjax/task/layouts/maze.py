@@ -115,8 +115,8 @@ def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -
 
 
 def _least(demand: Demand) -> tuple[float, float]:
-    side = demand.numbers["cells"][1] * (_PASSAGE + THICKNESS / 4096)
-    return side, demand.side
+    side = demand["cells"] * (_PASSAGE + THICKNESS / 4096)
+    return side, demand["side"]
 
 
 MAZE = ArenaLayout(

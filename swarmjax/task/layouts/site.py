@@ -8,7 +8,6 @@ import numpy as np
 from swarmjax.task.placement import MARGIN, Gaps, place, round_up, score_things
 
 Array = Any
-NUMBERS = ("gap", "width", "depth", "length", "radius", "apart")  # settings of a stage, m
 THICKNESS = round_up(0.02)  # thickness of walls within an arena, units
 LATTICE = 24  # points along each edge of an area
 
@@ -31,6 +30,12 @@ class Numbers(NamedTuple):
     length: Array
     radius: Array
     apart: Array
+
+
+NUMBERS = Numbers._fields  # settings of a stage, m
+# Numbers of a stage that a layout must have room for, by key: the number of robots, the smallest
+# side and breadth, m, and the largest value of each number that the layout reads.
+Demand = Mapping[str, float]
 
 
 class Site(NamedTuple):
@@ -71,22 +76,6 @@ class Drawn(NamedTuple):
     there: Array
     start: Array
     target: Array
-
-
-class Demand(NamedTuple):
-    """Numbers of a stage that a layout must have room for, m.
-
-    Attributes:
-      robots: number of robots.
-      side: smallest extent along x.
-      breadth: smallest extent along y.
-      numbers: smallest and largest value of each number that the layout reads.
-    """
-
-    robots: int
-    side: float
-    breadth: float
-    numbers: Mapping[str, tuple[float, float]]
 
 
 class ArenaLayout(NamedTuple):
@@ -153,13 +142,6 @@ def points(
     x = xp.broadcast_to(axes[0][:, None], (count, count))
     y = xp.broadcast_to(axes[1][None, :], (count, count))
     return xp.stack([x.reshape(-1), y.reshape(-1)], axis=-1)
-
-
-def place_targets(
-    site: Site, area: Array, score: Array, picks: Array, there: Array, xp: Any
-) -> Array:
-    """Places the targets of some robots in an area; returns [R, 2] units."""
-    return place(area, score, picks, there, site.gaps.target, xp)[0]
 
 
 def place_starts(
