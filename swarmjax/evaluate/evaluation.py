@@ -103,8 +103,7 @@ def _sum_up(
 
 def _rows(trial: Trial, rows: slice) -> Trial:
     """Keeps some of the policies of a trial."""
-    tables = {name: table[rows] for name, table in trial.measures.items()}
-    return trial._replace(measures=tables, arrival=trial.arrival[rows])
+    return trial._replace(measures={name: x[rows] for name, x in trial.measures.items()})
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:

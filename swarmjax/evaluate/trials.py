@@ -41,13 +41,11 @@ class Trial(NamedTuple):
       cell: Cell with E levels.
       shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
       measures: [P, E] of each measure that the engine computes.
-      arrival: [P, E, R] when robots arrived, s; inf if they did not.
     """
 
     cell: Cell
     shortest: np.ndarray
     measures: dict[str, np.ndarray]
-    arrival: np.ndarray
 
 
 class _Job(NamedTuple):
@@ -148,9 +146,8 @@ def _try(
     """Builds a trial from the policies' outcomes on a cell."""
     second = config.task.control_step
     rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
-    arrival = [np.where(each.arrived, each.arrival * second, np.inf) for each in outcomes]
     tables = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return Trial(cell, shortest, tables, np.stack(arrival))
+    return Trial(cell, shortest, tables)
 
 
 def _by_mjx(
