@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            evaluation = evaluate(settings, progress, lambda: _say(said))
+            evaluation = evaluate(settings, None, progress, lambda: _say(said))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import extension, policy_network
+from swarmjax import extension, policy, policy_network
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
@@ -110,7 +110,8 @@ def play(
     )
     network = None if trained.network is None else trained.network.params
     weights = trained.layers, trained.mean, trained.std, network, trained.hearing, trained.memory
-    outcome, broken = run(weights, trained.log_std, levels)
+    memory = policy.begin(trained, levels.present.shape)
+    outcome, broken = run(weights, trained.log_std, levels, memory)
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
@@ -129,7 +130,7 @@ def _program(
     activation: str,
     sampled: bool,
     network: Any,
-) -> Callable[[Any, ArrayLike, Level], tuple[Outcome, Array]]:
+) -> Callable[..., tuple[Outcome, Array]]:
     """Compiles the program for policies that differ only in their weights."""
     (encoding, limit), (speed, turn_rate) = seen, limits
     mine = replace(
@@ -139,18 +140,14 @@ def _program(
         electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
     )
 
-    def play(weights: Any, log_std: Array, levels: Level) -> tuple[Outcome, Array]:
+    def play(
+        weights: Any, log_std: Array, levels: Level, memory: Array | None
+    ) -> tuple[Outcome, Array]:
         mean = partial(_mean_action, activation, limit, weights, network, heard.count)
         act = partial(_act, mean, log_std if sampled else None)
-        memory = _begin(weights[-1], levels.present.shape)
         return run(mine, act, levels, steps, memory)[1:]
 
     return jax.jit(play)
-
-
-def _begin(memory: Any, shape: tuple[int, ...]) -> Array | None:
-    """Returns the memory of robots [*shape] before they see anything, [*shape, H]."""
-    return None if memory is None else jnp.zeros((*shape, memory[2].shape[1]), jnp.float32)
 
 
 def _act(

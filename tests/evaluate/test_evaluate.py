@@ -168,8 +168,9 @@ def test_cells_that_share_levels_are_not_pooled(
     monkeypatch.setattr(evaluate_summary, "about_cell", lambda *_: {})
     trials = [_trial("a"), _trial("b", seed=1_000_002), _trial("c", **other)]
     settings = EvaluateConfig(policy="", stage=_stage(2))
-    one = evaluate_summary.result(settings, "x", [], trials)["pooled"]
-    two = evaluate_summary.comparison(settings, "x", ([], []), (trials, trials))["pooled"]
+    one = evaluate_summary.result(settings, "x", [[]], trials)["pooled"]
+    twice = [each._replace(measures={"spl": each.measures["spl"].repeat(2, 0)}) for each in trials]
+    two = evaluate_summary.result(settings, "x", [[], []], twice)["pooled"]
     if shared:
         assert one is two is None
         return
