@@ -253,7 +253,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         judge, sight, arenas.data, pose, arenas.obstacle, arenas.level, arrived, clock
     )
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
-    events = measures.Step(
+    events = measures.Events(
         start=arenas.pose[..., :2],
         place=pose[..., :2],
         arrived=arrived,

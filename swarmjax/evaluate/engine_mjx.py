@@ -269,10 +269,10 @@ def _step(
     return (rollout.restart(moved, held, stays), outcome, broken, memory), None
 
 
-def _events(world: World, before: EnvState, after: EnvState) -> measures.Step:
+def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
     """Returns the events of a control step; training has counted contacts and infrared."""
     poses = jax.vmap(partial(physics.poses, world.physics))
-    return measures.Step(
+    return measures.Events(
         start=poses(before.sim)[..., :2],
         place=poses(after.sim)[..., :2],
         arrived=after.arrived,

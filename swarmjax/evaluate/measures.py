@@ -53,7 +53,7 @@ class Outcome(NamedTuple):
     anchor: Any
 
 
-class Step(NamedTuple):
+class Events(NamedTuple):
     """The events of a control step.
 
     Attributes:
@@ -99,7 +99,7 @@ def begin(place: Any, xp: Any) -> Outcome:
     )
 
 
-def tally(before: Outcome, step: Step, xp: Any) -> Outcome:
+def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
     """Adds a control step to the outcome of episodes.
 
     Args:
