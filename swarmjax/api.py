@@ -223,7 +223,7 @@ def evaluate_policy(
     config, _ = trained_settings.load(
         EvaluateConfig, words, entrants, stages[0] if stages else None
     )
-    return evaluation.judge_entrants(config, entrants).result
+    return evaluation.evaluate(config, entrants).result
 
 
 @_one_error

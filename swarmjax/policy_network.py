@@ -37,8 +37,8 @@ class PolicyNetwork:
         if self._apply is None:
             self._apply = self._compile()
         flat = x.reshape(-1, *x.shape[-2:])
-        found = np.asarray(self._apply(flat))
-        return found.reshape(*x.shape[:-1], found.shape[-1])
+        features = np.asarray(self._apply(flat))
+        return features.reshape(*x.shape[:-1], features.shape[-1])
 
     @property
     def params(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ Examples:
   python -m swarmjax.evaluate policy=runs/first/policy.npz
   # another stage, and the planar body
   python -m swarmjax.evaluate policy=runs/first/policy.npz stage=s3 robot=planar
-  # a suite, with tables and plots
+  # a suite, with tables in files
   python -m swarmjax.evaluate policy=runs/first/policy.npz suite=headline out=judged
   # all seeds of a run together
   python -m swarmjax.evaluate policy='runs/first/policy-seed*.npz'
@@ -32,11 +32,9 @@ from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
-from swarmjax.evaluate.trials import specialise
 from swarmjax.exit_codes import INTERRUPTED
 
-# The files in the folder of a result; two policies that are compared have no plots.
-_NAMES = ("result.json", "levels.csv", "measures.png", "times.png")
+_NAMES = ("result.json", "levels.csv")  # the files in the folder of a result
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -50,13 +48,12 @@ def main(arguments: Sequence[str]) -> int:
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            evaluation = evaluate(settings, progress, lambda: _say(said))
+            evaluation = evaluate(settings, None, progress, lambda: _say(said))
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
     if out is not None:
-        limits = [specialise(settings, trial.cell).step_limit for trial in evaluation.trials]
-        outputs.write(_content(out, evaluation, max(limits) * settings.task.control_step))
+        outputs.write(_content(out, evaluation))
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
@@ -75,19 +72,13 @@ def _files(out: Path) -> list[Path]:
     return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
 
 
-def _content(out: Path, evaluation: Evaluation, limit: float) -> dict[Path, bytes]:
-    """Makes the JSON file, or all files of a folder; `limit` is an episode's length, s."""
+def _content(out: Path, evaluation: Evaluation) -> dict[Path, bytes]:
+    """Makes the JSON file, or all files of a folder."""
     text = (json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n").encode()
     if out.suffix == ".json":
         return {out: text}
     levels = evaluate_table.levels(evaluation.entrants, evaluation.trials)
-    files = {"result.json": text, "levels.csv": levels.encode()}
-    if "policies" in evaluation.result:
-        from swarmjax.evaluate import figures  # Matplotlib takes a second to import
-
-        drawn = figures.png_files(evaluation.result, evaluation.trials, limit)
-        files |= {f"{name}.png": content for name, content in drawn.items()}
-    return {out / name: content for name, content in files.items()}
+    return dict(zip(_files(out), (text, levels.encode()), strict=True))
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ class EvaluateConfig(JudgeConfig):
     )
     out: str | None = field(
         default=None,
-        metadata=about("folder for result.json, levels.csv and plots, or a single .json file"),
+        metadata=about("folder for result.json and levels.csv, or a single .json file"),
     )
 
     def _check(self) -> None:

@@ -10,7 +10,7 @@ result does not depend on how the work is split up.
 
 import copy
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -46,11 +46,9 @@ class Arenas(NamedTuple):
       target: [A, R, 2] x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       level: [A] levels that the episodes started from.
-      seed: [A] seeds of the levels, uint32.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       observation: [A, R, O].
       apart: [A, R, 3] time since the last contact of each kind, s.
-      anchor: [A, R, 2] place near which a robot has recently stayed, m.
       outcome: Outcome since the start.
     """
 
@@ -61,50 +59,32 @@ class Arenas(NamedTuple):
     target: np.ndarray
     obstacle: np.ndarray
     level: Level
-    seed: np.ndarray
     pose: np.ndarray
     observation: np.ndarray
     apart: np.ndarray
-    anchor: np.ndarray
     outcome: Outcome
 
 
-class Controller(Protocol):
-    """Drives robots in a policy's place, with a memory that is passed in and returned."""
+def act(
+    judge: Judge, memory: np.ndarray | None, arenas: Arenas
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Returns the policy's memory after this control step, and its actions [A, R, U].
 
-    def init(self, arenas: Arenas) -> Any:
-        """Returns the memory of arenas that start: nested tuples of arrays [A, ...]."""
-        ...
+    The random numbers of an action depend only on level and clock.
 
-    def act(self, memory: Any, arenas: Arenas) -> tuple[Any, np.ndarray]:
-        """Returns the memory after this control step, and actions [A, R, U], -1..1."""
-        ...
-
-
-class ByPolicy(NamedTuple):
-    """The controller that follows a judge's policy; its draws depend only on level and clock."""
-
-    judge: Judge
-
-    def init(self, arenas: Arenas) -> np.ndarray | None:
-        """Returns the policy's memory at the start."""
-        return policy.begin(self.judge.policy, arenas.pose.shape[:2])
-
-    def act(
-        self, memory: np.ndarray | None, arenas: Arenas
-    ) -> tuple[np.ndarray | None, np.ndarray]:
-        """Returns the memory after this control step, and the policy's actions."""
-        normal: Any = 0.0
-        if self.judge.config.action == "sampled":
-            shape = (arenas.pose.shape[1], self.judge.policy.log_std.shape[1])
-            clock = arenas.outcome.clock
-            normal = noise.normal(arenas.seed, clock, Stream.ACTION, shape, np)
-        return policy.step(self.judge.policy, memory, arenas.observation, normal)
+    Args:
+      judge: Data that the arenas share.
+      memory: The policy's memory, from `policy.begin` or the step before.
+      arenas: The arenas.
+    """
+    normal: Any = 0.0
+    if judge.config.action == "sampled":
+        shape = (arenas.pose.shape[1], judge.policy.log_std.shape[1])
+        normal = noise.normal(arenas.level.seed, arenas.outcome.clock, Stream.ACTION, shape, np)
+    return policy.step(judge.policy, memory, arenas.observation, normal)
 
 
-def simulate(
-    judge: Judge, levels: Sequence[level.Level], controller: Controller | None = None
-) -> Outcome:
+def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
 
     With `task.arrival=hold` an episode ends once all its robots are within their targets.
@@ -112,7 +92,6 @@ def simulate(
     Args:
       judge: Data that the arenas share.
       levels: Levels to start from.
-      controller: Controller of the robots; None: the judge's policy.
 
     Returns:
       The outcomes of the episodes, in the order of `levels`.
@@ -121,11 +100,10 @@ def simulate(
       ConfigError: The physics of an episode breaks down.
     """
     rows, arenas = np.arange(len(levels)), start(judge, levels)
-    driver = controller or ByPolicy(judge)
-    memory = driver.init(arenas)
+    memory = policy.begin(judge.policy, arenas.pose.shape[:2])
     total = Outcome(*(np.zeros_like(field) for field in arenas.outcome))
     for _ in range(judge.config.step_limit):
-        memory, action = driver.act(memory, arenas)
+        memory, action = act(judge, memory, arenas)
         arenas = step(judge, arenas, action)
         for whole, part in zip(total, arenas.outcome, strict=True):
             whole[rows] = part
@@ -160,16 +138,14 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     pose, target, obstacle = (
         x.astype(np.float64) for x in (begun.start, begun.target, begun.obstacle)
     )
-    seed, side = begun.seed, begun.side
     realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
-    factors = task_factors.draw(seed, realism, robot, judge.spacing.robots, boxes, np)
+    factors = task_factors.draw(begun.seed, realism, robot, judge.spacing.robots, boxes, np)
     model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
-    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, side, strict=True)]
-    outcome = _no_outcome(len(levels), judge.spacing.robots)
+    data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, begun.side, strict=True)]
+    outcome = measures.begin(pose[..., :2], np)
     sight = look(judge, data, factors, pose, target, obstacle)
-    sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
-    sight = _hear(judge, data, sight, pose, obstacle)
+    sight = _look_further(judge, sight, data, pose, obstacle, begun, outcome.arrived, outcome.clock)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -179,30 +155,10 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         target=target,
         obstacle=obstacle,
         level=begun,
-        seed=seed,
         pose=pose,
         observation=seen,
         apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
-        anchor=pose[..., :2],
         outcome=outcome,
-    )
-
-
-def _no_outcome(count: int, robots: int) -> Outcome:
-    """Returns the outcome of episodes that have just begun."""
-    none = np.zeros((count, robots), np.int64)
-    by_kind = np.zeros((count, robots, len(gaps.KINDS)), np.int64)
-    return Outcome(
-        clock=none[:, 0],
-        arrived=none.astype(bool),
-        arrival=none,
-        contacts=by_kind,
-        touched=by_kind,
-        impulse=by_kind.astype(np.float64),
-        sensed=none,
-        moving=none,
-        path=none.astype(np.float64),
-        still=none,
     )
 
 
@@ -283,8 +239,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     task, before = judge.config.task, arenas.outcome.arrived
     if action is None:
         if judge.policy.carried:
-            raise PolicyError("the policy has a memory: pass the action that `ByPolicy` chooses.")
-        _, action = ByPolicy(judge).act(None, arenas)
+            raise PolicyError("the policy has a memory: pass the action that `act` chooses.")
+        _, action = act(judge, None, arenas)
     active = arrival.drives(task.arrival, before)
     memory, pose, impulse = _drive(judge, arenas, action, active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
@@ -293,78 +249,43 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
-    sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
-    sight = _hear(judge, arenas.data, sight, pose, arenas.obstacle)
-    memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
-    step = _Step(arrived, begins, touches, impulse, sight.ray < task.sensor_range)
-    anchor, outcome = _tally(arenas, pose, step)
-    return arenas._replace(
-        memory=memory, pose=pose, observation=seen, apart=apart, anchor=anchor, outcome=outcome
+    sight = _look_further(
+        judge, sight, arenas.data, pose, arenas.obstacle, arenas.level, arrived, clock
     )
+    memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
+    events = measures.Events(
+        start=arenas.pose[..., :2],
+        place=pose[..., :2],
+        arrived=arrived,
+        begins=begins,
+        touches=touches,
+        impulse=impulse,
+        sensed=(sight.ray < task.sensor_range).any(axis=-1),
+    )
+    outcome = measures.tally(arenas.outcome, events, np)
+    return arenas._replace(memory=memory, pose=pose, observation=seen, apart=apart, outcome=outcome)
 
 
-def _look_by_extension(
+def _look_further(
     judge: Judge,
     sight: Sight,
+    data: np.ndarray,
     pose: np.ndarray,
+    obstacle: np.ndarray,
     levels: Level,
     arrived: np.ndarray,
     clock: np.ndarray,
 ) -> Sight:
-    """Adds the observations of an extension."""
-    if judge.own is None:
-        return sight
-    return sight._replace(own=judge.own(electronics.view(sight, pose, levels, arrived, clock)))
-
-
-def _hear(
-    judge: Judge,
-    data: np.ndarray,
-    sight: Sight,
-    pose: np.ndarray,
-    obstacle: np.ndarray,
-) -> Sight:
-    """Adds the neighbours in range."""
+    """Adds the observations of an extension, and the neighbours in range."""
+    if judge.own is not None:
+        view = electronics.view(sight, pose, levels, arrived, clock)
+        sight = sight._replace(own=judge.own(view))
     settings = judge.electronics.neighbours
     if not settings.count:
         return sight
     hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
-    present = np.ones(pose.shape[:2], bool)  # in the judge no robot is absent
-    return sight._replace(heard=hearing.reachable(pose, present, hidden, settings, np))
-
-
-class _Step(NamedTuple):
-    """The events of a control step, [A, R]. Contacts are [A, R, 3] by kind, and rays are [A, R, K].
-
-    `arrived` tells which robots have arrived after the step, and `near` which rays met something.
-    """
-
-    arrived: np.ndarray
-    begins: np.ndarray
-    touches: np.ndarray
-    impulse: np.ndarray
-    near: np.ndarray
-
-
-def _tally(arenas: Arenas, pose: np.ndarray, step: _Step) -> tuple[np.ndarray, Outcome]:
-    """Adds a control step to the episodes' outcomes; returns the new anchors and outcomes."""
-    before, clock = arenas.outcome, arenas.outcome.clock + 1
-    under_way = ~before.arrived
-    since = np.where(under_way, clock[:, None], before.arrival)
-    driven = np.linalg.norm(pose[..., :2] - arenas.pose[..., :2], axis=-1)
-    away = np.linalg.norm(pose[..., :2] - arenas.anchor, axis=-1) > measures.STILL_RADIUS
-    return np.where(away[..., None], pose[..., :2], arenas.anchor), Outcome(
-        clock=clock,
-        arrived=step.arrived,
-        arrival=np.where(step.arrived, since, 0),
-        contacts=before.contacts + step.begins,
-        touched=before.touched + step.touches,
-        impulse=before.impulse + step.impulse,
-        sensed=before.sensed + (under_way & step.near.any(axis=-1)),
-        moving=before.moving + under_way,
-        path=before.path + np.where(under_way, driven, 0.0),
-        still=np.where(away | step.arrived, 0, before.still + 1),
-    )
+    # In the judge every robot is present.
+    return sight._replace(heard=hearing.reachable(pose, levels.present, hidden, settings, np))
 
 
 def _drive(

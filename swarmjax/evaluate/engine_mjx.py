@@ -8,7 +8,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from swarmjax import extension, policy_network
+from swarmjax import extension, policy, policy_network
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
@@ -27,7 +27,7 @@ from swarmjax.ppo.memory import remember
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
-from swarmjax.task import electronics, env
+from swarmjax.task import arrival, electronics, env
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.env import EnvState, World
@@ -110,13 +110,14 @@ def play(
     )
     network = None if trained.network is None else trained.network.params
     weights = trained.layers, trained.mean, trained.std, network, trained.hearing, trained.memory
-    outcome, broken = run(weights, trained.log_std, levels)
+    memory = policy.begin(trained, levels.present.shape)
+    outcome, broken = run(weights, trained.log_std, levels, memory)
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
             f"positions that are not finite: give more than {world.physics.substeps} substeps."
         )
-    return Outcome(**{name: np.asarray(field) for name, field in outcome.items()})
+    return Outcome(*map(np.asarray, outcome))
 
 
 @functools.lru_cache(maxsize=4)
@@ -129,7 +130,7 @@ def _program(
     activation: str,
     sampled: bool,
     network: Any,
-) -> Callable[[Any, ArrayLike, Level], tuple[dict[str, Array], Array]]:
+) -> Callable[..., tuple[Outcome, Array]]:
     """Compiles the program for policies that differ only in their weights."""
     (encoding, limit), (speed, turn_rate) = seen, limits
     mine = replace(
@@ -139,19 +140,14 @@ def _program(
         electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
     )
 
-    def play(weights: Any, log_std: Array, levels: Level) -> tuple[dict[str, Array], Array]:
+    def play(
+        weights: Any, log_std: Array, levels: Level, memory: Array | None
+    ) -> tuple[Outcome, Array]:
         mean = partial(_mean_action, activation, limit, weights, network, heard.count)
         act = partial(_act, mean, log_std if sampled else None)
-        memory = _begin(weights[-1], levels.present.shape)
-        arenas, counts, broken = run(mine, act, levels, steps, memory)
-        return _outcome(arenas, counts), broken
+        return run(mine, act, levels, steps, memory)[1:]
 
     return jax.jit(play)
-
-
-def _begin(memory: Any, shape: tuple[int, ...]) -> Array | None:
-    """Returns the memory of robots [*shape] before they see anything, [*shape, H]."""
-    return None if memory is None else jnp.zeros((*shape, memory[2].shape[1]), jnp.float32)
 
 
 def _act(
@@ -212,23 +208,13 @@ def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array
     return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
 
 
-class _Counts(NamedTuple):
-    """Counts of `Outcome` that training does not need, [E, R, ...]; `anchor` is as in the judge."""
-
-    arrival: Array
-    touched: Array
-    path: Array
-    anchor: Array
-    still: Array
-
-
 # Takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
 Actor = Callable[[Any, EnvState], tuple[Any, Array]]
 
 
 def run(
     world: World, act: Actor, levels: Level, steps: int, memory: Array | None
-) -> tuple[EnvState, _Counts, Array]:
+) -> tuple[EnvState, Outcome, Array]:
     """Runs an episode of each level.
 
     Args:
@@ -239,8 +225,8 @@ def run(
       memory: memory at the start.
 
     Returns:
-      The final arenas, counts, and whether the physics of each arena broke. Such an episode ends,
-      and its robots stay where they were before the step.
+      The final arenas, the outcomes, and whether the physics of each arena broke. Such an episode
+      ends, and its robots stay where they were before the step.
     """
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
@@ -249,17 +235,15 @@ def run(
     arenas = jax.vmap(lambda each: env.reset(world, each))(levels)
     unpack = partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
-    none = jnp.zeros(levels.present.shape, jnp.int32)
-    touched = jnp.zeros(arenas.apart.shape, jnp.int32)
-    counts = _Counts(none, touched, none.astype(jnp.float32), levels.start[..., :2], none)
+    outcome = measures.begin(levels.start[..., :2], jnp)
     unbroken = jnp.zeros(len(levels.side), bool)
     step = partial(_step, world, act)
-    carry = (arenas, counts, unbroken, memory)
-    (arenas, counts, broken, _), _ = jax.lax.scan(step, carry, length=steps)
-    return arenas, counts, broken
+    carry = (arenas, outcome, unbroken, memory)
+    (arenas, outcome, broken, _), _ = jax.lax.scan(step, carry, length=steps)
+    return arenas, outcome, broken
 
 
-_Carry = tuple[EnvState, _Counts, Array, Array | None]
+_Carry = tuple[EnvState, Outcome, Array, Array | None]
 
 
 def _step(
@@ -269,56 +253,31 @@ def _step(
     _: None,
 ) -> tuple[_Carry, None]:
     """Moves the arenas [E] whose episodes are not over by a control step."""
-    arenas, counts, broken, memory = carry
+    arenas, outcome, broken, memory = carry
     memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
-    over = broken | _all_arrived(arenas)
+    over = broken | arrival.complete(arenas.arrived, arenas.level.present)
     broken = broken | (~over & ~came.sound)
     stays = over | broken
     held = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
-    counted = _count(world, counts, arenas, moved)
-    counts = _Counts(
-        *(
-            jnp.where(stays.reshape(-1, *[1] * (new.ndim - 1)), old, new)
-            for old, new in zip(counts, counted, strict=True)
-        )
+    counted = measures.tally(outcome, _events(world, arenas, moved), jnp)
+    outcome = jax.tree.map(
+        lambda old, new: jnp.where(stays.reshape(-1, *[1] * (new.ndim - 1)), old, new),
+        outcome,
+        counted,
     )
-    return (rollout.restart(moved, held, stays), counts, broken, memory), None
+    return (rollout.restart(moved, held, stays), outcome, broken, memory), None
 
 
-def _count(world: World, counts: _Counts, before: EnvState, after: EnvState) -> _Counts:
-    """Adds a control step to the counts, as the judge does."""
+def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
+    """Returns the events of a control step; training has counted contacts and infrared."""
     poses = jax.vmap(partial(physics.poses, world.physics))
-    start, place = poses(before.sim)[..., :2], poses(after.sim)[..., :2]
-    driven = jnp.linalg.norm(place - start, axis=-1)
-    active = before.level.present & ~before.arrived
-    since = jnp.where(active, after.clock[:, None], counts.arrival)
-    away = jnp.linalg.norm(place - counts.anchor, axis=-1) > measures.STILL_RADIUS
-    return _Counts(
-        arrival=jnp.where(after.arrived, since, 0),
-        touched=counts.touched + ((after.apart == 0.0) & before.level.present[..., None]),
-        path=counts.path + jnp.where(active, driven, 0.0),
-        anchor=jnp.where(away[..., None], place, counts.anchor),
-        still=jnp.where(away | after.arrived, 0, counts.still + 1),
+    return measures.Events(
+        start=poses(before.sim)[..., :2],
+        place=poses(after.sim)[..., :2],
+        arrived=after.arrived,
+        begins=after.episode.contacts - before.episode.contacts,
+        touches=after.apart == 0.0,
+        impulse=jnp.nan,
+        sensed=after.episode.sensed > before.episode.sensed,
     )
-
-
-def _outcome(arenas: EnvState, counts: _Counts) -> dict[str, Array]:
-    """Builds the fields of the judge's `Outcome`, for arenas whose robots are all present."""
-    return {
-        "clock": arenas.clock,
-        "arrived": arenas.arrived,
-        "arrival": counts.arrival,
-        "contacts": arenas.episode.contacts,
-        "touched": counts.touched,
-        "impulse": jnp.full(counts.touched.shape, jnp.nan),
-        "sensed": arenas.episode.sensed,
-        "moving": arenas.episode.moving,
-        "path": counts.path,
-        "still": counts.still,
-    }
-
-
-def _all_arrived(arenas: EnvState) -> Array:
-    """Returns [E] whether every robot of the arena has arrived."""
-    return jnp.all(arenas.arrived | ~arenas.level.present, axis=-1)

@@ -11,13 +11,12 @@ from rich.progress import Progress
 from swarmjax.config import ConfigError, show
 from swarmjax.evaluate import cells, judge, summary
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.trials import Entrant, Trial
 
 
 class Evaluation(NamedTuple):
-    """The findings of an evaluation.
+    """The results of an evaluation.
 
     Attributes:
       result: Plain data for JSON; docs/interface.md lists it.
@@ -32,79 +31,42 @@ class Evaluation(NamedTuple):
 
 def evaluate(
     settings: EvaluateConfig,
+    entrants: list[Entrant] | None = None,
     progress: Progress | None = None,
     announce: Callable[[], object] = lambda: None,
 ) -> Evaluation:
-    """Judges policies.
+    """Judges policies of one recipe, or of two recipes to compare.
 
     Args:
       settings: Settings of the evaluation.
+      entrants: Policies of one recipe, already read from their files; None: those of `settings`.
       progress: Progress display; None shows nothing.
       announce: Called before the first episode, once all inputs are checked.
 
     Returns:
-      The findings.
+      The results.
 
     Raises:
       PolicyError: A policy is unsound, or does not fit the levels.
       ConfigError: A file is missing, a suite is unsound, or the physics breaks down.
     """
-    files = _sides(settings)
-    sides = [evaluate_trials.read_policies(each, settings.extensions) for each in files]
-    return _judge(settings, sides, progress or Progress(disable=True), announce)
-
-
-def judge_entrants(settings: EvaluateConfig, entrants: list[Entrant]) -> Evaluation:
-    """Judges policies of one recipe that have already been read from their files.
-
-    Args:
-      settings: Settings of the evaluation; its `policy` is ignored.
-      entrants: The policies.
-
-    Returns:
-      The findings.
-
-    Raises:
-      PolicyError: A policy does not fit the levels.
-      ConfigError: A suite is unsound, or the physics breaks down.
-    """
-    return _judge(settings, [entrants], Progress(disable=True), lambda: None)
-
-
-def _judge(
-    settings: EvaluateConfig,
-    sides: list[list[Entrant]],
-    progress: Progress,
-    announce: Callable[[], object],
-) -> Evaluation:
-    """Judges the policies of one side, or of two sides for a comparison."""
-    entrants = [each for side in sides for each in side]
+    sides = _read(settings) if entrants is None else [entrants]
+    every = [each for side in sides for each in side]
     for stage in cells.stages(settings):  # before drawing levels, which takes a while
-        for path, trained in entrants:
+        for path, trained in every:
             judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
     announce()
-    total = sum(len(entrants) * len(cell.episodes) for cell in suite.cells)
+    progress = progress or Progress(disable=True)
+    total = sum(len(every) * len(cell.episodes) for cell in suite.cells)
     report = partial(progress.advance, progress.add_task("episodes", total=total))
-    trials = list(evaluate_trials.run(settings, suite.cells, entrants, report))
-    return Evaluation(_sum_up(settings, suite, sides, trials), entrants, trials)
+    trials = list(evaluate_trials.run(settings, suite.cells, every, report))
+    return Evaluation(summary.result(settings, suite.name, sides, trials), every, trials)
 
 
-def _sum_up(
-    settings: EvaluateConfig, suite: Suite, sides: list[list[Entrant]], trials: list[Trial]
-) -> dict[str, Any]:
-    if settings.compare is None:
-        return summary.result(settings, suite.name, sides[0], trials)
-    first, second = sides
-    part = len(first)
-    pair = ([_rows(t, slice(part)) for t in trials], [_rows(t, slice(part, None)) for t in trials])
-    return summary.comparison(settings, suite.name, (first, second), pair)
-
-
-def _rows(trial: Trial, rows: slice) -> Trial:
-    """Keeps some of the policies of a trial."""
-    tables = {name: table[rows] for name, table in trial.measures.items()}
-    return trial._replace(measures=tables, arrival=trial.arrival[rows])
+def _read(settings: EvaluateConfig) -> list[list[Entrant]]:
+    """Reads the policies to judge: of one recipe, or of the two recipes to compare."""
+    return [evaluate_trials.read_policies(files, settings.extensions) for files in _sides(settings)]
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:

@@ -1,10 +1,10 @@
-"""The outcome of episodes, and the figures for comparing policies: NumPy only.
+"""The outcome of episodes, and the figures for comparing policies. No JAX.
 
-Every measure is one number per level; docs/evaluation.md gives its formula. Engines count events
-into an `Outcome`. Nothing here depends on the engine.
+Every measure is one number per level; docs/evaluation.md gives its formula. The engines pass the
+events of each control step to `tally`, and nothing here depends on the engine.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,18 +37,93 @@ class Outcome(NamedTuple):
       path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
       still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of one
         place; 0 if it has arrived.
+      anchor: [A, R, 2] that place, m.
     """
 
-    clock: np.ndarray
-    arrived: np.ndarray
-    arrival: np.ndarray
-    contacts: np.ndarray
-    touched: np.ndarray
-    impulse: np.ndarray
-    sensed: np.ndarray
-    moving: np.ndarray
-    path: np.ndarray
-    still: np.ndarray
+    clock: Any
+    arrived: Any
+    arrival: Any
+    contacts: Any
+    touched: Any
+    impulse: Any
+    sensed: Any
+    moving: Any
+    path: Any
+    still: Any
+    anchor: Any
+
+
+class Events(NamedTuple):
+    """The events of a control step.
+
+    Attributes:
+      start: [A, R, 2] places of the robots before the step, m.
+      place: [A, R, 2] places after it, m.
+      arrived: [A, R] whether a robot has arrived after the step.
+      begins: [A, R, 3] whether a contact begins, by kind.
+      touches: [A, R, 3] whether the robot touches something at the end of the step.
+      impulse: [A, R, 3] normal impulse of the contacts, N s, or nan.
+      sensed: [A, R] whether an infrared ray met something in range.
+    """
+
+    start: Any
+    place: Any
+    arrived: Any
+    begins: Any
+    touches: Any
+    impulse: Any
+    sensed: Any
+
+
+def begin(place: Any, xp: Any) -> Outcome:
+    """Returns the outcome of episodes that have just begun.
+
+    Args:
+      place: [A, R, 2] starts of the robots, m.
+      xp: `numpy` or `jax.numpy`.
+    """
+    count = xp.zeros(place.shape[:2], int)
+    by_kind = xp.zeros((*count.shape, len(gaps.KINDS)), int)
+    return Outcome(
+        clock=count[:, 0],
+        arrived=count.astype(bool),
+        arrival=count,
+        contacts=by_kind,
+        touched=by_kind,
+        impulse=by_kind.astype(float),
+        sensed=count,
+        moving=count,
+        path=count.astype(float),
+        still=count,
+        anchor=place,
+    )
+
+
+def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
+    """Adds a control step to the outcome of episodes.
+
+    Args:
+      before: Outcome before the step.
+      step: Events of the step.
+      xp: `numpy` or `jax.numpy`.
+    """
+    under_way, clock = ~before.arrived, before.clock + 1
+    since = xp.where(under_way, clock[:, None], before.arrival)
+    driven = xp.linalg.norm(step.place - step.start, axis=-1)
+    away = xp.linalg.norm(step.place - before.anchor, axis=-1) > STILL_RADIUS
+    return Outcome(
+        clock=clock,
+        arrived=step.arrived,
+        arrival=xp.where(step.arrived, since, 0),
+        contacts=before.contacts + step.begins,
+        touched=before.touched + step.touches,
+        impulse=before.impulse + step.impulse,
+        sensed=before.sensed + (under_way & step.sensed),
+        moving=before.moving + under_way,
+        path=before.path + xp.where(under_way, driven, 0.0),
+        still=xp.where(away | step.arrived, 0, before.still + 1),
+        anchor=xp.where(away[..., None], step.place, before.anchor),
+    )
 
 
 class Measure(NamedTuple):

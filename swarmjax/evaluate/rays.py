@@ -105,7 +105,7 @@ def hidden(
     # need no ray at all.
     near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
     asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
-    found = np.zeros(distance.shape, bool)
+    blocked = np.zeros(distance.shape, bool)
     for arena, i, j, box in zip(*np.nonzero(near & asked[..., None]), strict=True):
         geom, where = scene.ids.obstacle_geom[box], cast("mujoco.MjData", data[arena])
         start = np.array([*place[arena, i], epuck.SENSOR_HEIGHT])
@@ -115,8 +115,8 @@ def hidden(
         share = mujoco.mju_rayGeom(*frame, start, toward, kind)
         # -1 means no hit. If a line starts inside a box, the result is the place where it leaves
         # the box.
-        found[arena, i, j] |= 0.0 <= share < 1.0
-    return found | found.swapaxes(1, 2)
+        blocked[arena, i, j] |= 0.0 <= share < 1.0
+    return blocked | blocked.swapaxes(1, 2)
 
 
 def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:

@@ -104,18 +104,20 @@ def shortest(
     start, target, obstacle = (np.asarray(x, np.float64) for x in (start, target, obstacle))
     offset = target - start
     apart = np.linalg.norm(offset, axis=-1)
-    found = np.maximum(apart - target_radius, 0.0)
-    share = np.divide(found, apart, out=np.zeros_like(apart), where=apart > 0.0)
+    length = np.maximum(apart - target_radius, 0.0)
+    share = np.divide(length, apart, out=np.zeros_like(apart), where=apart > 0.0)
     ends = start + share[..., None] * offset
     barred = _barred(start[:, :, None], ends[:, :, None], obstacle[:, None], hull_radius)
     inside = 0.5 * np.asarray(side, np.float64) - hull_radius
-    walled = (found > 0.0) & ~_within(ends, inside[:, None])
+    walled = (length > 0.0) & ~_within(ends, inside[:, None])
     bent = barred.any(axis=-1) | walled
     for each in np.flatnonzero(bent.any(axis=-1)):
         arena = _arena(float(inside[each]), obstacle[each], hull_radius)
         for robot in np.flatnonzero(bent[each]):
-            found[each, robot] = _way(arena, start[each, robot], target[each, robot], target_radius)
-    return found
+            length[each, robot] = _way(
+                arena, start[each, robot], target[each, robot], target_radius
+            )
+    return length
 
 
 def _arena(inside: float, obstacle: np.ndarray, hull: float) -> _Arena:
@@ -223,8 +225,7 @@ def _are_free(arena: _Arena, point: int, others: np.ndarray) -> np.ndarray:
     new = others[np.isnan(arena.legs[point, others])]
     if new.size:
         one, some = _take(arena.outline, [point]), _take(arena.outline, new)
-        found = _legs(arena.boxes, _fan(one, some))
-        arena.legs[point, new] = arena.legs[new, point] = found
+        arena.legs[point, new] = arena.legs[new, point] = _legs(arena.boxes, _fan(one, some))
     return np.isfinite(arena.legs[point, others])
 
 
@@ -265,9 +266,9 @@ def _nearest(boxes: _Boxes, points: _Points) -> np.ndarray:
     """Returns the nearest boxes of each point, [V, M]."""
     x, y = np.maximum(np.abs(points.local) - boxes.half[:, None], 0.0)
     order = np.argpartition(x * x + y * y, _NEAREST, axis=-1)
-    found = np.zeros(order.shape, bool)
-    np.put_along_axis(found, order[:, :_NEAREST], True, axis=-1)
-    return found
+    nearest = np.zeros(order.shape, bool)
+    np.put_along_axis(nearest, order[:, :_NEAREST], True, axis=-1)
+    return nearest
 
 
 def _are_barred(boxes: _Boxes, lines: _Lines, pairs: np.ndarray) -> np.ndarray:

@@ -11,8 +11,6 @@ rest as given. The right draw depends on how the values were produced:
 =================  ==========================================  ==================================
 draw               each resample                               the interval is about
 =================  ==========================================  ==================================
-`runs_per_task`    draws runs for each task by itself, as      other runs, which train on each
-                   rliable does (stratified by task)           task by itself
 `runs`             draws runs with all their tasks             other runs, each judged on all
                                                                these tasks
 `tasks`            draws tasks with all their runs             these runs, all on the same other
@@ -33,8 +31,8 @@ refused. Values of nan and -inf are refused too.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,23 +42,10 @@ BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for th
 LEAST_DRAWN = 3
 CONFIDENCE = 0.95  # of every interval
 RESAMPLES = 2000
-_LAST_TWO = (-2, -1)
 
-type Draw = Literal["runs_per_task", "runs", "tasks", "runs_and_tasks"]
-_DRAWN = {  # what a draw draws
-    "runs_per_task": ("runs",),
-    "runs": ("runs",),
-    "tasks": ("tasks",),
-    "runs_and_tasks": ("runs", "tasks"),
-}
-
-
-class Statistic(Protocol):
-    """A statistic for a bootstrap: `iqm`, `cvar`, `np.mean`, `np.median`, or a partial of these."""
-
-    def __call__(self, x: np.ndarray, /, *, axis: tuple[int, int]) -> Any:
-        """Reduces two axes of x [..., runs, tasks]; returns [...]."""
-        ...
+type Draw = Literal["runs", "tasks", "runs_and_tasks"]
+# Reduces two axes of x [..., runs, tasks], as `iqm`, `cvar`, `np.mean` and partials of these do.
+type Statistic = Callable[..., Any]
 
 
 class Interval[T](NamedTuple):
@@ -140,10 +125,9 @@ def bootstrap(
     values: ArrayLike,
     statistic: Statistic,
     *,
-    draw: Draw = "runs_per_task",
+    draw: Draw = "runs",
     strata: Sequence[int] | None = None,
     resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> Interval[float]:
     """Computes a percentile interval of a statistic (Efron & Tibshirani 1993, chapter 13).
 
@@ -161,16 +145,15 @@ def bootstrap(
       strata: sizes of groups of consecutive tasks; tasks are drawn within each group (Efron &
         Tibshirani 1993, section 8.3). None draws among all tasks.
       resamples: number of resamples; 40 or more, so that one lies beyond each end of the interval.
-      seed: seed of the draws.
 
     Returns:
       Estimate and interval, in the unit of the statistic.
 
     Raises:
-      ValueError: an argument is refused, or the statistic gives nan or another shape.
+      ValueError: the values are refused.
     """
     table = _table("values", values, draw)
-    draws = _distributions((table,), statistic, _Resampling(draw, strata, resamples, seed))[0]
+    draws = _distributions((table,), statistic, _Resampling(draw, strata, resamples))[0]
     return _interval(float(_apply(statistic, table)), draws)
 
 
@@ -179,7 +162,7 @@ def paired(
     b: ArrayLike,
     statistic: Statistic,
     *,
-    draw: Draw = "runs_per_task",
+    draw: Draw = "runs",
     strata: Sequence[int] | None = None,
     resamples: int = RESAMPLES,
 ) -> Interval[float]:
@@ -220,7 +203,7 @@ def probability_of_improvement(
     a: ArrayLike,
     b: ArrayLike,
     *,
-    draw: Draw = "runs_per_task",
+    draw: Draw = "runs",
     strata: Sequence[int] | None = None,
     resamples: int = RESAMPLES,
 ) -> Interval[float]:
@@ -282,7 +265,7 @@ def curve(
       ValueError: As in `bootstrap`.
     """
     columns = _table("values", values, "runs").T[..., None]
-    points = [bootstrap(each, statistic, draw="runs", resamples=resamples) for each in columns]
+    points = [bootstrap(each, statistic, resamples=resamples) for each in columns]
     return Interval(*np.array(points).T)
 
 
@@ -310,13 +293,11 @@ def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
 
 def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     """Converts numbers [runs, tasks]; refuses too few runs or tasks to draw from."""
-    if draw not in _DRAWN:
-        raise ValueError(f"draw is '{draw}': give one of {', '.join(_DRAWN)}.")
     values = checked(name, x)
     if values.ndim != 2:
         raise ValueError(f"{name} has shape {values.shape}: give [runs, tasks].")
     for what, count in zip(("runs", "tasks"), values.shape, strict=True):
-        if what in _DRAWN[draw] and count < LEAST_DRAWN:
+        if what in draw and count < LEAST_DRAWN:
             raise ValueError(
                 f"{name} has {count} {what}: an interval over {what} needs {LEAST_DRAWN} or more."
             )
@@ -326,10 +307,9 @@ def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
 class _Resampling(NamedTuple):
     """How values [runs, tasks] are drawn; the fields are arguments of `bootstrap`."""
 
-    draw: str
+    draw: Draw
     strata: Sequence[int] | None
     resamples: int
-    seed: int = 0
 
     def blocks(self, cells: int) -> Iterator[int]:
         """Splits resamples, with this number of values each, into blocks that fit the memory."""
@@ -343,10 +323,9 @@ class _Resampling(NamedTuple):
         """Draws indices of values: two arrays that broadcast to [count, runs, tasks]."""
         runs, tasks = shape
         row, column = np.arange(runs)[:, None], np.arange(tasks)[None]
-        if "runs" in _DRAWN[self.draw]:
-            each = tasks if self.draw == "runs_per_task" else 1
-            row = random.integers(runs, size=(count, runs, each))
-        if "tasks" in _DRAWN[self.draw]:
+        if "runs" in self.draw:
+            row = random.integers(runs, size=(count, runs, 1))
+        if "tasks" in self.draw:
             column = random.integers(*self._group(tasks), size=(count, 1, tasks))
         return row, column
 
@@ -362,7 +341,7 @@ def _distributions(
     tables: tuple[np.ndarray, ...], statistic: Statistic, resampling: _Resampling
 ) -> np.ndarray:
     """Computes statistics [tables, resamples] of tables of one shape, all with the same draws."""
-    random, drawn = np.random.default_rng(resampling.seed), []
+    random, drawn = np.random.default_rng(0), []
     for count in resampling.blocks(tables[0].size):
         index = resampling.indices(random, count, tables[0].shape)
         drawn.append([_apply(statistic, table[index]) for table in tables])
@@ -371,14 +350,7 @@ def _distributions(
 
 def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
     """Computes statistics [...] of x [..., runs, tasks]."""
-    values = np.asarray(statistic(x, axis=_LAST_TWO))
-    if values.shape != x.shape[:-2]:
-        raise ValueError(
-            f"statistic of values of shape {x.shape} has shape {values.shape}: give {x.shape[:-2]}."
-        )
-    if np.isnan(values).any():
-        raise ValueError("statistic gives nan for values without nan.")
-    return values
+    return np.asarray(statistic(x, axis=(-2, -1)))
 
 
 def _interval(estimate: float, draws: np.ndarray) -> Interval[float]:

@@ -61,8 +61,6 @@ class CellConfig(Section):
             build(
                 RobotConfig, {"hull_friction": self.hull_friction}
             )  # which checks the lower bound too
-        if self.digest is not None and not re.fullmatch(r"[0-9a-f]{64}", self.digest):
-            raise ConfigError(f"digest is {show(self.digest)}: give 64 hexadecimal digits.")
         if self.shape != "box" and self.stage.level == "fixed":
             raise ConfigError(
                 f"shape is {self.shape}, but the stage's level is fixed: give shape=box."

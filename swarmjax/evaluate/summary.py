@@ -22,58 +22,48 @@ Measured = Mapping[str, np.ndarray]
 
 
 def result(
-    config: EvaluateConfig, suite: str | None, entrants: Sequence[Entrant], trials: Sequence[Trial]
-) -> dict[str, Any]:
-    """Collects all findings of an evaluation as plain data for JSON.
-
-    Args:
-      config: Settings of the evaluation.
-      suite: Its name, or None.
-      entrants: Policies of one recipe.
-      trials: Their results, one for each cell.
-
-    Returns:
-      The result; docs/interface.md lists it.
-    """
-    return {
-        **_about(config, suite),
-        "policies": [{"path": each.path, "digest": each.policy.digest} for each in entrants],
-        "cells": [
-            about_cell(config, trial) | {"measures": summarize(trial.measures)} for trial in trials
-        ],
-        "pooled": _pool(trials),
-    }
-
-
-def comparison(
     config: EvaluateConfig,
     suite: str | None,
-    entrants: tuple[Sequence[Entrant], Sequence[Entrant]],
-    trials: tuple[Sequence[Trial], Sequence[Trial]],
+    sides: Sequence[Sequence[Entrant]],
+    trials: Sequence[Trial],
 ) -> dict[str, Any]:
-    """Collects a comparison of two recipes on the same levels as plain data for JSON.
+    """Collects the results of an evaluation as plain data for JSON.
 
     Args:
       config: Settings of the evaluation.
       suite: Its name, or None.
-      entrants: Policies of the first and of the second recipe.
-      trials: Their results, one for each cell.
+      sides: Policies of one recipe, or of two recipes to compare, equally many of each.
+      trials: Their results, one for each cell, with the rows of the first side first.
 
     Returns:
       The result; docs/interface.md lists it.
     """
-    pairs = list(zip(*trials, strict=True))
+    about = [[{"path": path, "digest": trained.digest} for path, trained in each] for each in sides]
+    is_one = len(sides) == 1
     return {
         **_about(config, suite),
-        "compared": [
-            [{"path": each.path, "digest": each.policy.digest} for each in side]
-            for side in entrants
-        ],
+        **({"policies": about[0]} if is_one else {"compared": about}),
         "cells": [
-            about_cell(config, a) | {"measures": compare(a.measures, b.measures)} for a, b in pairs
+            about_cell(config, trial) | {"measures": _figures([trial], is_one=is_one)}
+            for trial in trials
         ],
-        "pooled": _pool(*trials),
+        "pooled": _pool(trials, is_one=is_one),
     }
+
+
+def _figures(
+    trials: Sequence[Trial], strata: Sequence[int] | None = None, *, is_one: bool
+) -> dict[str, dict[str, Any]]:
+    """Summarises cells together, or compares the two halves of their policies."""
+    measured = {
+        name: np.concatenate([trial.measures[name] for trial in trials], axis=1)
+        for name in trials[0].measures
+    }
+    if is_one:
+        return summarize(measured, strata)
+    halves = {name: np.split(table, 2) for name, table in measured.items()}
+    a, b = ({name: half[side] for name, half in halves.items()} for side in (0, 1))
+    return compare(a, b, strata)
 
 
 def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
@@ -158,25 +148,17 @@ def _draw(table: np.ndarray) -> Draw:
     return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
 
 
-def _join(tables: Sequence[Measured]) -> dict[str, np.ndarray]:
-    """Joins the levels of all cells, for measures that all cells have."""
-    return {name: np.concatenate([each[name] for each in tables], axis=1) for name in tables[0]}
-
-
-def _pool(*sides: Sequence[Trial]) -> dict[str, Any] | None:
-    """Summarises the levels of all cells together, for one side, or for both sides of a comparison.
+def _pool(trials: Sequence[Trial], *, is_one: bool) -> dict[str, Any] | None:
+    """Summarises the levels of all cells together.
 
     Returns None for a single cell, and if cells share levels. Figures of cells that share levels
     are not independent, but the intervals draw the levels of each cell independently.
     """
-    cells = [trial.cell for trial in sides[0]]
+    cells = [trial.cell for trial in trials]
     if len(cells) < 2 or any(_share(*pair) for pair in combinations(cells, 2)):
         return None
     strata = [len(cell.episodes) for cell in cells]
-    tables = [_join([trial.measures for trial in side]) for side in sides]
-    if len(tables) > 1:
-        return {"episodes": sum(strata), "measures": compare(tables[0], tables[1], strata)}
-    return {"episodes": sum(strata), "measures": summarize(tables[0], strata)}
+    return {"episodes": sum(strata), "measures": _figures(trials, strata, is_one=is_one)}
 
 
 def _share(a: Cell, b: Cell) -> bool:

@@ -79,10 +79,10 @@ def _table(console: Console, *heads: str) -> Table:
 def _show_cell(console: Console, cell: Mapping[str, Any]) -> None:
     """Prints one cell: a row for each measure."""
     table = _table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
-    for name, found in cell["measures"].items():
+    for name, figures in cell["measures"].items():
         measure = MEASURES[name]
-        mean, iqm, worst = (_number(found[key], measure) for key in ("mean", "iqm", "cvar"))
-        ends = [_interval(found[f"{key}_interval"], measure) for key in ("mean", "iqm")]
+        mean, iqm, worst = (_number(figures[key], measure) for key in ("mean", "iqm", "cvar"))
+        ends = [_interval(figures[f"{key}_interval"], measure) for key in ("mean", "iqm")]
         table.add_row(_label(measure), mean, ends[0], iqm, ends[1], worst)
     console.print(table)
 
@@ -97,9 +97,9 @@ def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
     console.print(table)
 
 
-def _shown(found: Mapping[str, Any], name: str, key: str, with_ends: bool) -> str:
-    shown = _number(found[name][key], MEASURES[name])
-    interval = found[name][f"{key}_interval"] if with_ends else None
+def _shown(figures: Mapping[str, Any], name: str, key: str, with_ends: bool) -> str:
+    shown = _number(figures[name][key], MEASURES[name])
+    interval = figures[name][f"{key}_interval"] if with_ends else None
     return shown if interval is None else f"{shown} {_interval(interval, MEASURES[name])}"
 
 
@@ -107,15 +107,15 @@ def _show_comparison(console: Console, cell: Mapping[str, Any]) -> None:
     """Prints one cell of a comparison: a row for each measure."""
     heads = ("a", "b", "b - a", "95 %", "b better, %", "95 %")
     table = _table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
-    for name, found in cell["measures"].items():
+    for name, figures in cell["measures"].items():
         measure, share = MEASURES[name], MEASURES["targets_reached"]
-        row = [_number(found["a"], measure), _number(found["b"], measure)]
-        if "difference" in found:
+        row = [_number(figures["a"], measure), _number(figures["b"], measure)]
+        if "difference" in figures:
             row += [
-                _number(found["difference"], measure, "+"),
-                _interval(found["difference_interval"], measure, "+"),
-                _number(found["improvement"], share),
-                _interval(found["improvement_interval"], share),
+                _number(figures["difference"], measure, "+"),
+                _interval(figures["difference_interval"], measure, "+"),
+                _number(figures["improvement"], share),
+                _interval(figures["improvement_interval"], share),
             ]
         table.add_row(_label(measure), *row)
     console.print(table)

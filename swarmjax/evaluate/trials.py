@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from itertools import batched, islice
+from itertools import islice
 from multiprocessing import get_context, parent_process
 from typing import NamedTuple
 
@@ -41,26 +41,23 @@ class Trial(NamedTuple):
       cell: Cell with E levels.
       shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
       measures: [P, E] of each measure that the engine computes.
-      arrival: [P, E, R] when robots arrived, s; inf if they did not.
     """
 
     cell: Cell
     shortest: np.ndarray
     measures: dict[str, np.ndarray]
-    arrival: np.ndarray
 
 
 class _Job(NamedTuple):
-    """Levels for one process and one policy, and whether the process also finds shortest paths."""
+    """Levels [A] of a cell for one process, and the half edges of the cell's boxes."""
 
     config: EvaluateConfig
-    policy: Policy
+    entrants: Sequence[Entrant]
     half: np.ndarray
     levels: Level
-    find_ways: bool
 
 
-# The outcome of each policy on a cell, and the lengths of the cell's shortest paths.
+# The outcome of each policy on some levels, and the lengths of their shortest paths.
 type _Result = tuple[list[Outcome], np.ndarray]
 
 
@@ -104,19 +101,18 @@ def run(
     # Checks all cells before the first one runs.
     configs = [specialise(config, cell) for cell in cells]
     play = _by_mjx if config.engine == "mjx" else _by_c
-    played = play(config, cells, entrants, report)
+    played = play(configs, cells, entrants, report)
     for mine, cell, (outcomes, shortest) in zip(configs, cells, played, strict=True):
         yield _try(mine, cell, outcomes, shortest)
 
 
-def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> EvaluateConfig:
-    """Makes the settings for one cell, and for one policy.
+def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
+    """Makes the settings for one cell.
 
     Args:
       config: Settings of the evaluation.
       cell: Cell that sets the stage, shape and seed. A cell with values for realism or hull
         friction sets these too. A cell with a step limit sets it if `config` has none.
-      path: Path of the policy.
 
     Returns:
       The settings.
@@ -130,8 +126,6 @@ def specialise(config: EvaluateConfig, cell: Cell, path: str | None = None) -> E
     return replace(
         config,
         robot=robot,
-        policy=path or config.policy,
-        compare=None if path else config.compare,
         suite=None,
         stage=cell.stage,
         shape=cell.shape,
@@ -148,13 +142,12 @@ def _try(
     """Builds a trial from the policies' outcomes on a cell."""
     second = config.task.control_step
     rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
-    arrival = [np.where(each.arrived, each.arrival * second, np.inf) for each in outcomes]
     tables = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return Trial(cell, shortest, tables, np.stack(arrival))
+    return Trial(cell, shortest, tables)
 
 
 def _by_mjx(
-    config: EvaluateConfig,
+    configs: Sequence[EvaluateConfig],
     cells: Sequence[Cell],
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
@@ -163,65 +156,49 @@ def _by_mjx(
     from swarmjax.evaluate import engine_mjx
     from swarmjax.run import compile_cache  # these modules need JAX
 
-    for cell in cells:
-        mine, outcomes = specialise(config, cell, entrants[0].path), []
+    for config, cell in zip(configs, cells, strict=True):
+        outcomes, sampled = [], config.action == "sampled"
         with compile_cache.use():
-            world = engine_mjx.load(mine, cell.largest_half, len(cell.episodes))
-            for each in entrants:
-                sampled, steps = config.action == "sampled", mine.step_limit
+            world = engine_mjx.load(config, cell.largest_half, len(cell.episodes))
+            for _, trained in entrants:
                 outcomes.append(
-                    engine_mjx.play(world, cell.levels, each.policy, steps, sampled=sampled)
+                    engine_mjx.play(world, cell.levels, trained, config.step_limit, sampled=sampled)
                 )
                 report(len(cell.episodes))
-        yield outcomes, ways(mine, cell.levels)
+        yield outcomes, ways(config, cell.levels)
 
 
 def _by_c(
-    config: EvaluateConfig,
+    configs: Sequence[EvaluateConfig],
     cells: Sequence[Cell],
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
     """Runs all episodes in batches, in as many processes as are useful."""
-    workers = config.workers or provenance.cores()
-    jobs = [
-        [
-            job
-            for i, each in enumerate(entrants)
-            for job in _jobs(config, cell, each, workers, find_ways=not i)
-        ]
-        for cell in cells
-    ]
+    workers = configs[0].workers or provenance.cores()
+    jobs = [_jobs(*each, entrants, workers) for each in zip(configs, cells, strict=True)]
     every = [job for mine in jobs for job in mine]
     done = work(_simulate, every, min(workers, len(every)))
     for mine in jobs:
-        parts = []
-        for part in islice(done, len(mine)):
-            parts.append(part)
-            report(len(part[0].clock))
-        yield _put_together(parts, len(entrants))
-
-
-def _put_together(
-    parts: Sequence[tuple[Outcome, np.ndarray | None]], policies: int
-) -> tuple[list[Outcome], np.ndarray]:
-    """Joins the batches of a cell, policy by policy."""
-    outcomes = [outcome for outcome, _ in parts]
-    lengths = [lengths for _, lengths in parts if lengths is not None]
-    by_policy = batched(outcomes, len(parts) // policies)
-    whole = [Outcome(*map(np.concatenate, zip(*mine, strict=True))) for mine in by_policy]
-    return whole, np.concatenate(lengths)
+        batches = []
+        for outcomes, lengths in islice(done, len(mine)):
+            batches.append((outcomes, lengths))
+            report(len(lengths) * len(outcomes))
+        parts, shortest = zip(*batches, strict=True)
+        by_policy = zip(*parts, strict=True)
+        whole = [Outcome(*map(np.concatenate, zip(*each, strict=True))) for each in by_policy]
+        yield whole, np.concatenate(shortest)
 
 
 def _jobs(
-    config: EvaluateConfig, cell: Cell, entrant: Entrant, workers: int, *, find_ways: bool
+    config: EvaluateConfig, cell: Cell, entrants: Sequence[Entrant], workers: int
 ) -> list[_Job]:
-    """Splits the levels of a cell into batches for one policy."""
-    count, mine = len(cell.episodes), specialise(config, cell, entrant.path)
+    """Splits the levels of a cell into batches."""
+    count = len(cell.episodes)
     size = min(BATCH, math.ceil(count / workers))
     rows = [slice(first, first + size) for first in range(0, count, size)]
     parts = [Level(*(field[part] for field in cell.levels)) for part in rows]
-    return [_Job(mine, entrant.policy, cell.half, part, find_ways) for part in parts]
+    return [_Job(config, entrants, cell.half, part) for part in parts]
 
 
 def work[Job, Result](
@@ -259,10 +236,12 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _simulate(job: _Job) -> tuple[Outcome, np.ndarray | None]:
-    judge = evaluate_judge.load(job.config, job.policy, job.half)
-    outcome = engine_c.simulate(judge, split(job.levels))
-    return outcome, ways(job.config, job.levels) if job.find_ways else None
+def _simulate(job: _Job) -> _Result:
+    """Runs each policy on the levels of a job."""
+    levels = split(job.levels)
+    judges = [evaluate_judge.load(job.config, each.policy, job.half) for each in job.entrants]
+    outcomes = [engine_c.simulate(judge, levels) for judge in judges]
+    return outcomes, ways(job.config, job.levels)
 
 
 def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:

@@ -1,5 +1,5 @@
 """Exports policies in other forms: NumPy, ONNX, C99 and a Webots controller.
 
-Imports policy files, sensor responses of `sim`, and `run` to read a run's checkpoint. `folder.py`
-decides which files may be replaced. Start with `__main__.main`.
+Imports policy files, sensor responses of `sim`, and `run` to read a run's checkpoint. Start with
+`__main__.main`.
 """

@@ -20,25 +20,26 @@ Examples:
 import re
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from swarmjax import command, outputs, policy_file
-from swarmjax.config import ConfigError, files
+from swarmjax import command, epuck, outputs, policy_file
+from swarmjax.config import ConfigError, files, show
 from swarmjax.evaluate import trained_settings
-from swarmjax.export import c, check, onnx, webots
+from swarmjax.export import c, onnx, webots, webots_controller
 from swarmjax.export.config import ExportConfig
+from swarmjax.policy import PolicyError
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.load_settings import from_stored, read_config, settle
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
+from swarmjax.sim import response
 
 # Default name of each format if `out` is not given.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
-# A controller with one of these names would hide a module that it or NumPy imports.
-_IMPORTED = sys.stdlib_module_names | {"policy", "controller", "numpy"}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -119,11 +120,6 @@ def _check_controller(out: Path) -> None:
             f"out is {out}, whose name is also the controller's: give letters, digits, _ and - "
             "only, as in swarmjax_epuck."
         )
-    if out.name in _IMPORTED:
-        raise ConfigError(
-            f"out is {out}, whose name is also the controller's, but the controller imports a "
-            "module of that name: give another name, as in swarmjax_epuck."
-        )
 
 
 def convert(settings: ExportConfig, source: Path, out: Path) -> None:
@@ -144,7 +140,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
         return
     # Refuses numbers that the archive's reader leaves unchecked.
     trained_settings.trained(meta, str(source))
-    check.expressible(meta, settings.format, settings.sensors)
+    _check_form(meta, settings.format, settings.sensors)
     trained = policy_file.read(source)
     if settings.format == "onnx":
         outputs.write({out: onnx.render(trained)})
@@ -156,6 +152,41 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     inside = {out / name: each for name, each in made.items()}
     outputs.check("out", inside, overwrite=settings.overwrite)
     outputs.write(inside)
+
+
+def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
+    """Checks that a form can hold a policy, and that its controller can measure all inputs."""
+    if "network" in meta:
+        raise PolicyError(
+            f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
+            "extension that only npz supports: give format=npz, or train with algo.network=mlp."
+        )
+    if form != "webots":
+        return
+    if "neighbours" in meta["observation"]:
+        raise PolicyError(
+            "format is webots, but the policy observes neighbours, and the controller has no "
+            "board for range and bearing: give format=c or onnx, and your own controller."
+        )
+    known = webots_controller.QUANTITIES
+    unknown = [name for name in meta["observation"]["names"] if name not in known]
+    if unknown:
+        raise PolicyError(
+            f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
+            "cannot measure: give format=c or onnx, and your own controller."
+        )
+    _check_range(meta, sensors)
+
+
+def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
+    """Checks that the policy's infrared reaches no further than the sensors measure distances."""
+    reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
+    if meta["observation"]["encoding"] == "metric" and reach > farthest:
+        raise ConfigError(
+            f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
+            f"sensors={sensors} measure distances only to {farthest:g} m: train with "
+            f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
+        )
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def _about(trained: Policy) -> dict[str, Any]:
         "control_step": short(task["control_step"]),
         "control_step_f": number(task["control_step"]),
         "target_radius_f": number(task["target_radius"]),
-        "holds": int(export_layout.holds(trained)),
+        "holds": int(task["arrival"] == "hold"),
         "observations": trained.mean.shape[1],
         "actions": sizes[-1],
         "learners": learners,
@@ -138,9 +138,8 @@ def _layout(trained: Policy) -> dict[str, Any]:
     rows = zip(*(action[key] for key in ("names", "units", "low", "high")), strict=True)
     commanded = [f" *   {n:<20} {u:<8} {short(a)} to {short(b)}" for n, u, a, b in rows]
     observed = [
-        f" *   [{i}] {one.name:<20} {one.unit:<8} offset {short(one.offset)}, "
-        f"scale {short(one.scale)}"
-        for i, one in enumerate(export_layout.entries(trained))
+        f" *   [{i}] {name:<20} {unit:<8} offset {short(offset)}, scale {short(scale)}"
+        for i, (name, unit, offset, scale) in enumerate(export_layout.entries(trained))
     ]
     return {"observation": "\n".join(observed), "action": "\n".join(commanded)}
 

@@ -1,31 +1,18 @@
 """Describes a policy's observation in words, for users of an exported policy."""
 
-from typing import NamedTuple
-
 from swarmjax.policy import Policy
 
 
-class LayoutEntry(NamedTuple):
-    """One entry of an observation: (quantity - offset) / scale, in units of the quantity."""
+def entries(policy: Policy) -> list[tuple[str, str, float, float]]:
+    """Lists name, unit, offset and scale of the [O] entries of a policy's observation.
 
-    name: str
-    unit: str
-    offset: float
-    scale: float
-
-
-def entries(policy: Policy) -> list[LayoutEntry]:
-    """Lists the entries of a policy's observation.
+    An entry is (quantity - offset) / scale, with the other three in the quantity's unit.
 
     Args:
       policy: the policy.
-
-    Returns:
-      [O] entries in order.
     """
     layout = policy.meta["observation"]
-    keys = ("names", "units", "offset", "scale")
-    return [LayoutEntry(*row) for row in zip(*(layout[key] for key in keys), strict=True)]
+    return list(zip(*(layout[key] for key in ("names", "units", "offset", "scale")), strict=True))
 
 
 def table(policy: Policy) -> str:
@@ -38,9 +25,8 @@ def table(policy: Policy) -> str:
       A Markdown table with one row per entry, without a final newline.
     """
     lines = ["| entry | quantity | unit | offset | scale |", "|---|---|---|---|---|"]
-    for i, entry in enumerate(entries(policy)):
-        numbers = f"{short(entry.offset)} | {short(entry.scale)}"
-        lines.append(f"| {i} | {entry.name} | {entry.unit} | {numbers} |")
+    for i, (name, unit, offset, scale) in enumerate(entries(policy)):
+        lines.append(f"| {i} | {name} | {unit} | {short(offset)} | {short(scale)} |")
     return "\n".join(lines)
 
 
@@ -61,15 +47,6 @@ def trained_as(policy: Policy) -> str:
         f"robot {robot['preset']} (body {robot['body']}{hull}), sensors {sensors['preset']} "
         f"(response {sensors['response']}, range {short(sensors['range'])} m)"
     )
-
-
-def holds(policy: Policy) -> bool:
-    """Tells whether a policy was trained to keep driving within its target (`task.arrival=hold`).
-
-    Args:
-      policy: the policy.
-    """
-    return policy.meta["task"]["arrival"] == "hold"
 
 
 def short(value: float) -> str:

@@ -56,7 +56,7 @@ def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
       clipped to the range from 0 to `reach`.
     """
     counts = np.array([row[1] for row in epuck.INFRARED_TABLE])
-    found: dict[str, Any] = {
+    curve: dict[str, Any] = {
         "answers": answers,
         "distance": response.distance("webots", counts, np).tolist(),
         "counts": counts.tolist(),
@@ -69,9 +69,9 @@ def sensors(answers: Literal["webots", "real"]) -> dict[str, Any]:
             "span": saturation - free,
             "to_hull": response.TO_HULL,
         }
-        found["fit"] = {key: value.tolist() for key, value in fit.items()}
-        found["fit"]["reach"] = response.REACH["real"]
-    return found
+        curve["fit"] = {key: value.tolist() for key, value in fit.items()}
+        curve["fit"]["reach"] = response.REACH["real"]
+    return curve
 
 
 def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> dict[str, str]:
@@ -94,7 +94,7 @@ def _about(trained: Policy, answers: Literal["webots", "real"], name: str) -> di
         "digest": trained.digest,
         "period": f"{1000 * task['control_step']:g}",
         "robots": "" if trained.is_shared else each,
-        "arrival": stays if layout.holds(trained) else stops,
+        "arrival": stays if task["arrival"] == "hold" else stops,
         "trained": layout.trained_as(trained),
         "observes": f"encoding `{trained.encoding}`, infrared up to {meta['sensors']['range']:g} m",
         "answers": who[answers],

@@ -143,16 +143,6 @@ def to_target(
     return math.hypot(x, y), math.atan2(math.sin(turn), math.cos(turn))
 
 
-def begin(trained: Policy, robot: int) -> np.ndarray | None:
-    """Returns the memory of a robot with a new target; None if the policy has no memory.
-
-    Args:
-      trained: the policy.
-      robot: the robot's number, from 0.
-    """
-    return policy.begin(trained, (1 if trained.is_shared else robot + 1,))
-
-
 def wheel_speeds(
     trained: Policy,
     observation: np.ndarray,
@@ -167,7 +157,7 @@ def wheel_speeds(
       observation: [O] the observation.
       robot: the robot's number, from 0.
       normal: [U] standard normal numbers to draw the action; 0 gives the most likely one.
-      memory: memory that `begin` or the previous call returned.
+      memory: memory that `policy.begin` or the previous call returned.
 
     Returns:
       [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
@@ -205,24 +195,21 @@ def find_devices(robot: Any, period: int) -> Devices:
     Raises:
       ValueError: if a device is missing.
     """
-    found = {name: robot.getDevice(name) for name in (*INFRARED, "gps", "compass", *MOTORS)}
-    for name, device in found.items():
+    devices = {name: robot.getDevice(name) for name in (*INFRARED, "gps", "compass", *MOTORS)}
+    for name, device in devices.items():
         if device is None:
             raise ValueError(
                 f"the robot has no device {name!r}: an E-puck with a GPS and a Compass in its "
                 "turretSlot has all of them."
             )
-    for name in (*INFRARED, "gps", "compass"):
-        found[name].enable(period)
-    for name in MOTORS:
-        found[name].setPosition(math.inf)  # controlled by speed
-        found[name].setVelocity(0.0)
-    return Devices(
-        [found[name] for name in INFRARED],
-        found["gps"],
-        found["compass"],
-        [found[name] for name in MOTORS],
-    )
+    *sensors, left, right = devices.values()
+    for sensor in sensors:
+        sensor.enable(period)
+    for motor in (left, right):
+        motor.setPosition(math.inf)  # controlled by speed
+        motor.setVelocity(0.0)
+    *infrared, gps, compass = sensors
+    return Devices(infrared, gps, compass, [left, right])
 
 
 def control_period(trained: Policy, basic_step: float) -> int:
@@ -274,7 +261,8 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
         orders = parse([*_custom(robot, given), *words])
         wheels = np.zeros(len(MOTORS))
         if (orders.target, orders.robot) != pursued:  # an episode begins
-            memory, pursued = begin(trained, orders.robot), (orders.target, orders.robot)
+            rows = 1 if trained.is_shared else orders.robot + 1
+            memory, pursued = policy.begin(trained, (rows,)), (orders.target, orders.robot)
         if orders.target is not None and orders.target != parked_at:
             distance, bearing = to_target(
                 devices.gps.getValues(), devices.compass.getValues(), orders.target

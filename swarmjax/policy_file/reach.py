@@ -1,7 +1,7 @@
 """Checks that no action of a policy can leave float32, whatever the robot observes."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -10,21 +10,9 @@ from swarmjax.policy import PolicyError
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-class Inputs(NamedTuple):
-    """The bounded numbers that enter a network.
-
-    Attributes:
-      limit: largest magnitude of a normalised observation.
-      neighbours: number of neighbours that a robot hears.
-      is_bounded: whether the activation stays within -1 and 1, as tanh does.
-    """
-
-    limit: float
-    neighbours: int
-    is_bounded: bool
-
-
-def check_reach(arrays: Mapping[str, np.ndarray], depth: int, inputs: Inputs) -> None:
+def check_reach(
+    arrays: Mapping[str, np.ndarray], depth: int, meta: Mapping[str, Any], neighbours: int
+) -> None:
     """Refuses weights with which a sum could overflow float32, and an action become NaN.
 
     The bound of a layer's output is the largest sum of its weights' magnitudes, times the bound of
@@ -34,7 +22,8 @@ def check_reach(arrays: Mapping[str, np.ndarray], depth: int, inputs: Inputs) ->
     Args:
       arrays: the arrays of a policy by name, with sound shapes.
       depth: number of hidden layers.
-      inputs: bounds of what enters the network.
+      meta: the description of the policy, with sound fields.
+      neighbours: number of neighbours that a robot hears.
 
     Raises:
       PolicyError: if a bound is not a number of float32.
@@ -43,24 +32,24 @@ def check_reach(arrays: Mapping[str, np.ndarray], depth: int, inputs: Inputs) ->
     def out(layer: str, bound: float) -> float:
         kernel, bias = (arrays[f"actor/{layer}/{part}"] for part in ("kernel", "bias"))
         sums = np.abs(kernel).sum(axis=1, dtype=np.float64)
-        found = bound * float(sums.max()) + float(np.abs(bias).max())
-        if not found <= _LARGEST:
+        most = bound * float(sums.max()) + float(np.abs(bias).max())
+        if not most <= _LARGEST:
             raise PolicyError(
                 f"actor/{layer} has weights up to {np.abs(kernel).max():.3g} and biases up to "
                 f"{np.abs(bias).max():.3g}: expected smaller ones, since sums could reach "
-                f"{found:.3g}, and float32 holds at most {_LARGEST:.3g}."
+                f"{most:.3g}, and float32 holds at most {_LARGEST:.3g}."
             )
-        return found
+        return most
 
     def active(bound: float) -> float:
-        return 1.0 if inputs.is_bounded else bound
+        return 1.0 if meta["activation"] == "tanh" else bound
 
     if any(name.startswith("network/") for name in arrays):
         return
-    bound = inputs.limit
-    if inputs.neighbours:
+    bound = limit = float(meta["observation"]["limit"])
+    if neighbours:
         heard = active(out("hearing", bound))
-        bound = max(bound, inputs.neighbours * inputs.limit * heard)
+        bound = max(bound, neighbours * limit * heard)
     for i in range(depth):
         bound = active(out(f"hidden_{i}", bound))
     if "actor/memory/input/kernel" in arrays:

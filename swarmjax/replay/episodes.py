@@ -98,7 +98,7 @@ def _record(
         levels = cells.split(cell.levels)
         runs = []
         for each in entrants:
-            judged = evaluate_trials.specialise(settings.evaluation, cell, each.path)
+            judged = evaluate_trials.specialise(settings.evaluation, cell)
             judge = evaluate_judge.load(judged, each.policy, cell.half)
             runs.append(record.record(judge, [levels[pick.row] for pick in mine]))
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):

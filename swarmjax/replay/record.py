@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from swarmjax import policy
 from swarmjax.config.section import build_stored
 from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
@@ -130,10 +131,9 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     mount = electronics.mount(arenas.factors)
     frames = [_look(judge, arenas)]
     over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
-    driver = engine_c.ByPolicy(judge)
-    memory = driver.init(arenas)
+    memory = policy.begin(judge.policy, arenas.pose.shape[:2])
     while len(frames) <= judge.config.step_limit and not over.all():
-        memory, action = driver.act(memory, arenas)
+        memory, action = engine_c.act(judge, memory, arenas)
         arenas = engine_c.step(judge, arenas, action)
         frames.append(_look(judge, arenas))
         over |= frames[-1].arrived.all(axis=-1)

@@ -58,9 +58,9 @@ def _by_mjx(path: Path, actions: np.ndarray) -> Outcome:
         return memory, jnp.asarray(actions)[row]
 
     run = jax.jit(partial(engine_mjx.run, world, act, steps=len(actions) + 5))
-    arenas, counts, broken = run(levels, memory=None)
+    _, outcome, broken = run(levels, memory=None)
     assert not np.asarray(broken).any()
-    return Outcome(**jax.tree.map(np.asarray, engine_mjx._outcome(arenas, counts)))
+    return Outcome(*map(np.asarray, outcome))
 
 
 @pytest.fixture(scope="module", params=[_by_c, _by_mjx], ids=["c", "mjx"])

@@ -17,7 +17,7 @@ from holding import ENTERS, LEAVES, OTHER, RETURNS
 from swarmjax import policy_file
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate import judge as evaluate_judge
-from swarmjax.evaluate.engine_c import Arenas
+from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.replay import pack, page, record
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import Recording
@@ -38,19 +38,14 @@ def _settings(policy: Path, *words: str) -> ReplayConfig:
     return load_levels(ReplayConfig, [f"policy={policy}", *WORDS, *words])
 
 
-class _Driver:
+def _act(judge: Judge, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
     """Replaces the policy by the actions of the scene in tests/holding.py."""
-
-    def init(self, arenas: Arenas) -> None:
-        """Returns None, since there is no memory."""
-
-    def act(self, memory: None, arenas: Arenas) -> tuple[None, np.ndarray]:
-        row = min(int(arenas.outcome.clock[0]), RETURNS - 1)
-        return memory, np.broadcast_to(holding.actions()[row], (len(arenas.data), 2, 2))
+    row = min(int(arenas.outcome.clock[0]), RETURNS - 1)
+    return memory, np.broadcast_to(holding.actions()[row], (len(arenas.data), 2, 2))
 
 
 def _drive(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(engine_c, "ByPolicy", lambda judge: _Driver())
+    patch.setattr(engine_c, "act", _act)
 
 
 @pytest.fixture(scope="module")

@@ -35,12 +35,14 @@ def steer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _trial(reached: list, contacts: list, time: list):
-    found = {
+    measured = {
         "targets_reached": np.array([reached]),
         "contacts_per_robot": np.array([contacts]),
         "episode_time_s": np.array([time]),
     }
-    return SimpleNamespace(cell=SimpleNamespace(episodes=np.arange(len(reached))), found=found)
+    return SimpleNamespace(
+        cell=SimpleNamespace(episodes=np.arange(len(reached))), measures=measured
+    )
 
 
 def test_the_worst_reached_least_then_touched_most_then_took_longest():

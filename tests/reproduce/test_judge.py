@@ -47,6 +47,7 @@ def test_a_row_is_computed_from_all_episodes(
             moving=np.array([[10, 10], [20, 20]]),
             path=zero,
             still=zero,
+            anchor=np.zeros((2, 2, 2)),
         )
 
     monkeypatch.setattr(engine_c, "simulate", simulate)
