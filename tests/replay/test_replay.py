@@ -40,7 +40,7 @@ def _trial(reached: list, contacts: list, time: list):
         "contacts_per_robot": np.array([contacts]),
         "episode_time_s": np.array([time]),
     }
-    return SimpleNamespace(cell=SimpleNamespace(episodes=np.arange(len(reached))), found=found)
+    return SimpleNamespace(cell=SimpleNamespace(episodes=np.arange(len(reached))), measures=found)
 
 
 def test_the_worst_reached_least_then_touched_most_then_took_longest():
