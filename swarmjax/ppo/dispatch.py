@@ -10,9 +10,8 @@ import jax
 
 from swarmjax.config import ConfigError, show
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.networks import Networks, Sizes
-from swarmjax.ppo.optimizer import Learning, Progress
 
 # XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8

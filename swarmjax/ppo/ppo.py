@@ -20,15 +20,13 @@ from flax import struct
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.extension import Network
 from swarmjax.ppo import batch as batches
-from swarmjax.ppo import dispatch, losses, networks, normalizer, optimizer
+from swarmjax.ppo import dispatch, gradients, networks
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.memory import NO_MEMORY, Recall
-from swarmjax.ppo.networks import Params, Sizes
-from swarmjax.ppo.normalizer import Normalizer
-from swarmjax.ppo.optimizer import Learning, Progress
+from swarmjax.ppo.networks import Normalizer, Params, Sizes
 from swarmjax.shards import ALONE, Shards
 
 _ADVANTAGE_EPSILON = 1e-8
@@ -93,7 +91,7 @@ class PPO:
           ConfigError: the network is missing or does not fit, or the backend is not available.
         """
         nets = networks.make(config, sizes, pieces, dispatch.memory_kernels(config))
-        adam = optimizer.make(config, updates)
+        adam = gradients.make_optimizer(config, updates)
         learning = Learning(config, nets, adam, shards, side_by_side)
         return cls(learning, sizes, dispatch.resolve(config, nets, sizes))
 
@@ -109,7 +107,7 @@ class PPO:
         return LearnerState(
             params=params,
             optimizer_state=self.learning.optimizer.init(params),
-            normalizer=normalizer.init(self.sizes.observation),
+            normalizer=Normalizer.init(self.sizes.observation),
             explored=jnp.zeros((), jnp.int32) if scheduled else None,
         )
 
@@ -136,7 +134,7 @@ class PPO:
         acted = self.learning.networks.act(learner.params, seen, memory)
         chex.assert_equal_shape([acted.mean, noise])
         action = acted.mean + acted.std * noise
-        return action, losses.log_density(acted.mean, acted.std, action), acted.memory
+        return action, gradients.log_density(acted.mean, acted.std, action), acted.memory
 
     def value(
         self, learner: LearnerState, observation: jax.Array, state: Any = (), memory: Any = ()
@@ -186,7 +184,7 @@ class PPO:
 
         Returns:
           The state after, the same on all devices, and metrics, each []. The metrics of
-          `losses.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
+          `gradients.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
           `skipped_steps` counts the steps that were not finite. `std` is the policy's mean
           deviation after the update.
         """
@@ -201,11 +199,11 @@ class PPO:
         # Without a finite sample no step is finite either.
         lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
         metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
-        metrics = optimizer.mean_of_taken(metrics)
+        metrics = gradients.mean_of_taken(metrics)
         metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
         moments = learner.normalizer
         if config.normalize_observations:
-            moments = normalizer.update(moments, batch.observation, batch.valid, shards)
+            moments = moments.update(batch.observation, batch.valid, shards)
             moments = _leave_neighbours(moments, self.sizes)
         return replace(
             learner, params=params, optimizer_state=optimizer_state, normalizer=moments
@@ -243,7 +241,7 @@ def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerS
 
 def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
     """Normalises raw observations [..., O] for the networks, within +-10."""
-    return normalizer.normalize(learner.normalizer, observation)
+    return learner.normalizer.normalize(observation)
 
 
 def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
@@ -314,10 +312,10 @@ def _learn(
 
     def step(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
         minibatch = _gather(samples, rows, config)
-        gradient = jax.grad(losses.ppo_loss, has_aux=True)(
+        gradient = jax.grad(gradients.ppo_loss, has_aux=True)(
             progress[0], minibatch, learning.networks, config, expected_valid
         )
-        return optimizer.take(learning, progress, gradient, jnp.any(minibatch.valid))
+        return gradients.take(learning, progress, gradient, jnp.any(minibatch.valid))
 
     # Whole groups are shuffled, because they are faster to gather than single samples.
     groups, keys = samples.valid.shape[0], jax.random.split(key, config.epochs)

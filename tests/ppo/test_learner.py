@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import losses, networks, optimizer, ppo
+from swarmjax.ppo import gradients, networks, ppo
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -28,7 +28,7 @@ def _ppo(config: AlgoConfig = CONFIG) -> PPO:
 @functools.partial(jax.jit, static_argnames="config")
 def _update(
     state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
-) -> tuple[LearnerState, losses.Metrics]:
+) -> tuple[LearnerState, gradients.Metrics]:
     return _ppo(config).update(state, batch, key)
 
 
@@ -167,7 +167,7 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
     valid = np.asarray(batch.valid)
     advantage = np.asarray(batch.advantage)
     inside = advantage[valid]
-    minibatch = losses.Minibatch(
+    minibatch = gradients.Minibatch(
         observation=ppo.normalize(state, batch.observation)[valid],
         action=batch.action[valid],
         log_prob=batch.log_prob[valid],
@@ -175,7 +175,7 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
         return_=batch.return_[valid],
         valid=jnp.ones(valid.sum(), bool),
     )
-    (_, expected), gradient = jax.value_and_grad(losses.ppo_loss, has_aux=True)(
+    (_, expected), gradient = jax.value_and_grad(gradients.ppo_loss, has_aux=True)(
         state.params,
         minibatch,
         _ppo(ONE_STEP).learning.networks,
@@ -245,7 +245,7 @@ def test_actor_and_critic_move_at_their_own_learning_rates() -> None:
     moves = _step_sizes(state.params, updated.params)
     # Adam's first step is rate * g / (|g| + 1e-5): the rate, less a share of about 1e-5 / |g|. The
     # largest |g| of each network is at least 1e-3 here, so the share is at most 1e-2.
-    rates = optimizer.learning_rates(ONE_STEP, UPDATES)
+    rates = gradients.learning_rates(ONE_STEP, UPDATES)
     np.testing.assert_allclose(moves["actor"], rates["actor"], rtol=1e-2)
     np.testing.assert_allclose(moves["critic"], rates["critic"], rtol=1e-2)
 
@@ -377,7 +377,7 @@ def test_adam_takes_its_epsilon_from_the_config() -> None:
     # A step of rate * g / (|g| + 10) is at most a tenth of the rate times the norm of g, which is
     # far below the rate itself.
     move = _step_sizes(state.params, updated.params)["critic"]
-    rate = optimizer.learning_rates(config, UPDATES)["critic"]
+    rate = gradients.learning_rates(config, UPDATES)["critic"]
     assert 0.0 < move < 0.1 * rate * float(metrics["grad_norm"])
     assert move < 0.5 * rate
 

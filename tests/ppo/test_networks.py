@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from swarmjax.ppo import losses, networks
+from swarmjax.ppo import gradients, networks
 from swarmjax.ppo.config import AlgoConfig
 
 OBSERVATION, U = 3, 2
@@ -97,7 +97,7 @@ def test_log_prob_equals_scipy(mean: np.ndarray, action: np.ndarray, std: np.nda
     expected = scipy.stats.norm.logpdf(action, mean, std).sum(axis=-1)
     # float32 relative rounding of terms up to 0.5 * (6 / 0.125)**2 = 1152.
     np.testing.assert_allclose(
-        losses.log_density(mean, std, action), expected, rtol=1e-5, atol=1e-5
+        gradients.log_density(mean, std, action), expected, rtol=1e-5, atol=1e-5
     )
 
 
@@ -105,7 +105,7 @@ def test_entropy_equals_scipy() -> None:
     std = np.array([0.2, 1.7], np.float32)
     # float32 rounding of terms of order 1.
     np.testing.assert_allclose(
-        losses.entropy(std), scipy.stats.norm.entropy(scale=std).sum(), atol=1e-6
+        gradients.entropy(std), scipy.stats.norm.entropy(scale=std).sum(), atol=1e-6
     )
 
 

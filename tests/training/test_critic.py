@@ -15,7 +15,7 @@ from flax import linen as nn
 from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
-from swarmjax.ppo import dispatch, losses, networks, ppo
+from swarmjax.ppo import dispatch, gradients, networks, ppo
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -224,7 +224,7 @@ def test_a_value_that_only_the_state_tells_is_learned() -> None:
 def test_a_state_changes_nothing_of_the_policy_but_by_its_guess(
     backend: dispatch.Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(losses, "GUESS_COST", 0.0)
+    monkeypatch.setattr(gradients, "GUESS_COST", 0.0)
     # No clipping here: it scales both networks by one norm, so the critic would change the actor.
     config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
     made = _ppo(config, backend)

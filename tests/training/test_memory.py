@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.ppo import losses, ppo
+from swarmjax.ppo import gradients, ppo
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.ppo import LearnerState
@@ -73,8 +73,8 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
     nets = trained.program.ppo.learning.networks
-    (mean, std, *_), value = losses.evaluate(_one(learners).params, nets, minibatch)
-    log_prob = losses.log_density(mean, std, minibatch.action)
+    (mean, std, *_), value = gradients.evaluate(_one(learners).params, nets, minibatch)
+    log_prob = gradients.log_density(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
     assert trained.over.any()  # episodes end within the rollout
