@@ -40,7 +40,7 @@ from swarmjax.task.env import EnvState
 from swarmjax.training import mesh, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 # Control steps per call of physics and environment: whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}
@@ -82,7 +82,7 @@ def prepare(settings: TrainConfig) -> Prepared:
     program, schedule = programs.load(settings)
     init = mesh.init(program)
     template: TrainState = jax.eval_shape(init, schedule)
-    keys = jax.vmap(jax.random.key)(np.array(seeds.numbers(settings), np.uint32))
+    keys = jax.vmap(jax.random.key)(np.array(settings.numbers, np.uint32))
     train = partial(seeds.chunk(program), schedule)
     environments, arenas = partial(_environments, program), template.arenas
     return Prepared(

@@ -16,7 +16,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 
 @dataclass(frozen=True)

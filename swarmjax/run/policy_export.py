@@ -15,7 +15,6 @@ from swarmjax.run.checkpoint import Leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import observation, pieces
 from swarmjax.task.config import resolve_encoding
-from swarmjax.training import seeds
 
 POLICY = "policy.npz"
 
@@ -151,6 +150,6 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
     Raises:
       CheckpointError: if the checkpoint was made with another config.
     """
-    lane = seeds.numbers(trained).index(seed)
+    lane = trained.numbers.index(seed)
     arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

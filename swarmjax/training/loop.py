@@ -24,8 +24,7 @@ from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, rollout
 from swarmjax.training.config import ProgramConfig
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 # XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
 # the next. A step of 8,192 arenas thus took 542 us instead of 606 us on an H100
@@ -122,13 +121,13 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, shards = program.config, program.shards
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=config.waiting)
+    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=program.waiting)
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
-    batch = rollout.batch(program, trajectory, state.arenas.recall, ended, config.learners)
+    batch = rollout.batch(program, trajectory, state.arenas.recall, ended)
     explored = rollout.explore(program, state.learners, config.algo.rollout_length)
-    learn_keys = jax.random.split(learn_key, config.learners)
+    learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
     curriculum = curricula.observe(
         program.curriculum(schedule),
@@ -189,7 +188,7 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    if program.config.learners > 1:
+    if len(learners.normalizer.count) > 1:
         carried = _copied(carried, before.met, after.met)
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))

@@ -5,7 +5,7 @@ with N the robots of an arena that one learner drives.
 """
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum.cohorts import UNCOUNTED
-from swarmjax.curriculum.engine import Next
+from swarmjax import extension
+from swarmjax.curriculum import stages as curricula
+from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, Next, Schedule
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
-from swarmjax.ppo.ppo import LearnerState
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, extended, level
@@ -25,7 +26,38 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.task.stage import Stage
-from swarmjax.training.program import Program
+from swarmjax.training.config import ProgramConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Program[C: ProgramConfig]:
+    """The parts that fix the compiled program; `program.py` builds them.
+
+    Attributes:
+      config: its settings.
+      world: the compiled environment.
+      ppo: how the learners act and learn.
+      by_robot: whether to report each episode robot by robot.
+      waiting: episodes that are drawn for each arena before a rollout.
+      rows: most updates of one call.
+    """
+
+    config: C
+    world: World
+    ppo: PPO
+    by_robot: bool = False
+    waiting: int = 1
+    rows: int = 1
+
+    @property
+    def shards(self) -> Shards:
+        """How the arenas are spread over devices."""
+        return self.ppo.learning.shards
+
+    def curriculum(self, schedule: Schedule) -> Curriculum:
+        """Returns the curriculum with the numbers of a schedule."""
+        own = extension.load(self.config.extensions).curricula
+        return curricula.make(schedule, self.config.curriculum, own)
 
 
 @struct.dataclass
@@ -86,7 +118,7 @@ def draw_starts(
 ) -> Arena:
     """Draws the levels of episodes that wait until their arena is free.
 
-    They are drawn before a rollout, `config.waiting` for each arena, and not at every step. An
+    They are drawn before a rollout, `program.waiting` for each arena, and not at every step. An
     arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
     otherwise short episodes would count more often than long ones.
 
@@ -154,9 +186,7 @@ def collect(
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
 
-def batch(
-    program: Program, trajectory: Trajectory, memory: Recall, ended: Ended, learners: int
-) -> Batch:
+def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended) -> Batch:
     """Turns a rollout into the samples of an update.
 
     Args:
@@ -164,12 +194,11 @@ def batch(
       trajectory: [T, L, A, N, ...].
       memory: [A, R, H] memory of the arenas before the rollout.
       ended: [T, A] episodes that ended in it.
-      learners: L.
 
     Returns:
       [L] batches, each of A groups with T * N samples.
     """
-    first = jax.tree.map(lambda x: to_learners(x, learners), memory)
+    first = jax.tree.map(lambda x: to_learners(x, trajectory.valid.shape[1]), memory)
     each = jax.vmap(program.ppo.batch, in_axes=(1, 0, None))
     return each(trajectory, first, ended.episodes > 0)
 

@@ -16,14 +16,8 @@ from jax import Array
 
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.training import loop
-from swarmjax.training.config import ProgramConfig
 from swarmjax.training.loop import Metrics, TrainState
-from swarmjax.training.program import Program
-
-
-def numbers(config: ProgramConfig) -> range:
-    """Returns the seeds of a run, in the order of the seed axis."""
-    return config.numbers
+from swarmjax.training.rollout import Program
 
 
 def chunk(program: Program) -> Callable[[Schedule, TrainState, Array], tuple[TrainState, Metrics]]:

@@ -28,8 +28,7 @@ from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
 from swarmjax.training import loop, mesh, rollout, seeds
 from swarmjax.training import program as programs
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 
 class Trained(NamedTuple):

@@ -20,8 +20,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 SIZE, UPDATES = 4, 6
 
@@ -56,7 +55,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     arenas, trajectory, ended = collect(last.learners, before, waiting, jax.random.key(2))
-    batch = rollout.batch(program, trajectory, before.recall, ended, config.learners)
+    batch = rollout.batch(program, trajectory, before.recall, ended)
     over = np.asarray(ended.episodes) > 0
     return Trained(program, schedule, last, arenas, trajectory, over, batch)
 

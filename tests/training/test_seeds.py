@@ -19,7 +19,7 @@ from swarmjax.task.env import World
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 SEEDS, UPDATES = 3, np.int32(2)
 Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]
@@ -214,7 +214,7 @@ def test_networks_know_how_many_learners_train_side_by_side(tiny_config: TrainCo
 
 
 def test_numbers_count_up_from_the_seed(tiny_config: TrainConfig) -> None:
-    assert list(seeds.numbers(replace(tiny_config, seed=7, seeds=3))) == [7, 8, 9]
+    assert list(replace(tiny_config, seed=7, seeds=3).numbers) == [7, 8, 9]
 
 
 def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
