@@ -31,7 +31,7 @@ from benchmarks.lines import Line
 from benchmarks.mujoco_arena import Moved, MujocoArena
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
-from swarmjax.ppo import gradients
+from swarmjax.ppo import optimizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.load_settings import load_train
 from swarmjax.task import observation
@@ -183,7 +183,7 @@ def ppo_settings(robots: int) -> dict[str, Any]:
         "gamma": algo.discount,
         "gae_lambda": algo.gae_lambda,
         "clip_range": algo.clip_epsilon,
-        "learning_rate": gradients.learning_rates(algo, trained.updates)["actor"],
+        "learning_rate": optimizer.learning_rates(algo, trained.updates)["actor"],
         "vf_coef": algo.value_cost,
         "ent_coef": algo.entropy_cost,
         "max_grad_norm": algo.max_grad_norm,

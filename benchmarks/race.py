@@ -15,7 +15,7 @@ Brax differs in these points:
   has one initialisation for all of them;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
-- no compiler options for XLA (`loop.compiler_options`);
+- no compiler options for XLA (`program.compiler_options`);
 - no mask, so robots that have arrived stay in its batch (docs/adapters.md).
 
 All of Brax's robot steps count as transitions. Our trainer's transitions are only the robot steps
@@ -45,7 +45,7 @@ from benchmarks import learners_judge, lines, peers, steps_per_second, timing
 from swarmjax import environment
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.ppo import gradients
+from swarmjax.ppo import optimizer
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.compiled import compile_chunk
@@ -216,7 +216,7 @@ def _our_settings(trained: TrainConfig) -> dict[str, Any]:
         "clipping_epsilon": algo.clip_epsilon,
         "entropy_cost": algo.entropy_cost,
         "vf_loss_coefficient": algo.value_cost,
-        "learning_rate": gradients.learning_rates(algo, trained.updates)["actor"],
+        "learning_rate": optimizer.learning_rates(algo, trained.updates)["actor"],
         "max_grad_norm": algo.max_grad_norm,
     }
 

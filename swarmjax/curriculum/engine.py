@@ -386,14 +386,9 @@ def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> Coh
     def total(x: Array) -> Array:
         return jnp.sum(jnp.where(mine, x, 0), axis=(1, 2))
 
-    new = CohortTally(
-        episodes=total(ended.episodes),
-        targets=total(ended.targets),
-        reached=total(ended.reached),
-        complete=total(ended.all_reached),
-        contacts=total(jnp.sum(ended.contacts, axis=-1)),
-        reward=total(ended.reward),
-    )
+    contacts = jnp.sum(ended.contacts, axis=-1)
+    counts = (ended.episodes, ended.targets, ended.reached, ended.all_reached, contacts)
+    new = CohortTally(*map(total, (*counts, ended.reward)))
     return CohortTally(*(a + b for a, b in zip(tally, shards.sum(new), strict=True)))
 
 

@@ -24,13 +24,6 @@ Progress = tuple[Params, optax.OptState]
 # Weight of the guess of the state that the critic sees. Whole runs with 0.02 solved more than runs
 # with 0 (docs/worlds-notes.md, "The guess of the state").
 GUESS_COST = 0.02
-# The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well if the sum of their rates
-# over all gradient steps equalled that of 6,000 to 15,000 steps whose rates fall from 3e-4 to 0.
-# Larger sums ended worse (docs/results.md, "Why more training made the swarm worse").
-_RATES = {"actor": 3e-4, "critic": 1e-3}
-_FULL_RATE_STEPS = 15_000
-# Mean over the run of the factor that a schedule applies to a rate.
-_MEAN_OF_SCHEDULE = {"constant": 1.0, "linear": 0.5}
 
 
 @struct.dataclass(kw_only=True)
@@ -67,7 +60,7 @@ class Learning(NamedTuple):
     Attributes:
       config: settings of PPO.
       networks: actor and critic.
-      optimizer: the optimiser that `make_optimizer` made.
+      optimizer: the optimiser that `optimizer.make` made.
       shards: how the samples are spread over devices.
       side_by_side: how many learners a device trains at once.
     """
@@ -127,7 +120,15 @@ def ppo_loss(
         [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
     )
     metrics = _terms(*evaluate(params, networks, minibatch), minibatch, config, expected_valid)
-    return _total(metrics, config), metrics
+    total = (
+        metrics["policy_loss"]
+        + config.value_cost * metrics["value_loss"]
+        - config.entropy_cost * metrics["entropy"]
+        + config.bound_cost * metrics["bound_loss"]
+    )
+    if "guess_loss" in metrics:
+        total = total + GUESS_COST * metrics["guess_loss"]
+    return total, metrics
 
 
 def _terms(
@@ -160,19 +161,6 @@ def _terms(
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return metrics
-
-
-def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
-    """Returns the sum [] of the loss's terms, weighted by their costs."""
-    total = (
-        metrics["policy_loss"]
-        + config.value_cost * metrics["value_loss"]
-        - config.entropy_cost * metrics["entropy"]
-        + config.bound_cost * metrics["bound_loss"]
-    )
-    if "guess_loss" not in metrics:
-        return total
-    return total + GUESS_COST * metrics["guess_loss"]
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
@@ -244,65 +232,6 @@ def entropy(std: jax.Array) -> jax.Array:
     """
     chex.assert_rank(std, 1)
     return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
-
-
-def gradient_steps(config: AlgoConfig, updates: int) -> int:
-    """Counts the gradient steps of a run, including those without a valid sample.
-
-    Args:
-      config: Passes over each rollout, and minibatches of each pass.
-      updates: Number of updates of the whole run.
-    """
-    return updates * config.epochs * config.num_minibatches
-
-
-def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
-    """Chooses the learning rates that a run begins with.
-
-    A rate that is null in the config becomes its value in `_RATES` times a share of at most 1. The
-    share limits the sum of the rates over the run. The limit is the sum over `_FULL_RATE_STEPS`
-    steps whose rates fall linearly to 0.
-
-    Args:
-      config: Learning rates, or None for the rule; their schedule.
-      updates: Number of updates of the whole run.
-
-    Returns:
-      The rate of the `actor` and of the `critic`.
-    """
-    mean = _MEAN_OF_SCHEDULE[config.learning_rate_schedule]
-    most = _FULL_RATE_STEPS * _MEAN_OF_SCHEDULE["linear"]
-    share = min(1.0, most / max(1.0, mean * gradient_steps(config, updates)))
-    given = {"actor": config.actor_learning_rate, "critic": config.critic_learning_rate}
-    return {name: _RATES[name] * share if rate is None else rate for name, rate in given.items()}
-
-
-def make_optimizer(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
-    """Makes the optimiser: one clip over all gradients, if any, then Adam for each network.
-
-    Args:
-      config: Learning rates, their schedule, and the norm at which gradients are clipped.
-      updates: Number of updates of the whole run: the learning rate's horizon.
-
-    Returns:
-      An optimiser for `{"actor": .., "critic": ..}`.
-    """
-    rates, steps = learning_rates(config, updates), gradient_steps(config, updates)
-
-    def adam(learning_rate: float) -> optax.GradientTransformation:
-        schedule = {
-            "constant": optax.constant_schedule(learning_rate),
-            "linear": optax.linear_schedule(learning_rate, 0.0, steps),
-        }[config.learning_rate_schedule]
-        return optax.adam(schedule, eps=config.adam_epsilon)
-
-    adams = optax.partition(
-        {name: adam(rate) for name, rate in rates.items()},
-        {"actor": "actor", "critic": "critic"},
-    )
-    if config.max_grad_norm is None:
-        return adams
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adams)
 
 
 def take(

@@ -7,7 +7,7 @@ groups.
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from flax import struct
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.extension import Network
 from swarmjax.ppo import batch as batches
-from swarmjax.ppo import dispatch, gradients, networks
+from swarmjax.ppo import dispatch, exploration, gradients, networks, optimizer
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
@@ -91,7 +91,7 @@ class PPO:
           ConfigError: the network is missing or does not fit, or the backend is not available.
         """
         nets = networks.make(config, sizes, pieces, dispatch.memory_kernels(config))
-        adam = gradients.make_optimizer(config, updates)
+        adam = optimizer.make(config, updates)
         learning = Learning(config, nets, adam, shards, side_by_side)
         return cls(learning, sizes, dispatch.resolve(config, nets, sizes))
 
@@ -130,7 +130,7 @@ class PPO:
           The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
           after.
         """
-        seen = normalize(learner, observation)
+        seen = learner.normalizer.normalize(observation)
         acted = self.learning.networks.act(learner.params, seen, memory)
         chex.assert_equal_shape([acted.mean, noise])
         action = acted.mean + acted.std * noise
@@ -151,7 +151,7 @@ class PPO:
         Returns:
           The expected discounted return, [...], and the memory after.
         """
-        seen = normalize(learner, observation)
+        seen = learner.normalizer.normalize(observation)
         return self.learning.networks.value(learner.params, seen, state, memory)
 
     def batch(self, trajectory: Trajectory, memory: Recall, over: jax.Array) -> Batch:
@@ -224,7 +224,7 @@ class PPO:
             return learner
         # The count stays at its largest value, since a run may go on from another one's count.
         explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
-        std = scheduled_std(self.config, explored - 1)
+        std = exploration.scheduled_std(self.config, explored - 1)
         return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
 
     def explore_anew(self, learner: LearnerState) -> LearnerState:
@@ -237,11 +237,6 @@ def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerS
     actor = learner.params["actor"]
     actor = actor | {"log_std": jnp.full_like(actor["log_std"], log_std)}
     return replace(learner, params=learner.params | {"actor": actor})
-
-
-def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
-    """Normalises raw observations [..., O] for the networks, within +-10."""
-    return learner.normalizer.normalize(observation)
 
 
 def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
@@ -279,7 +274,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
     if config.advantage == "gae":
         advantage = _normalize_advantages(advantage, valid, shards)
     samples = Minibatch(
-        observation=normalize(learner, batch.observation),
+        observation=learner.normalizer.normalize(batch.observation),
         action=batch.action,
         log_prob=batch.log_prob,
         advantage=advantage,
@@ -347,45 +342,3 @@ def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> j
 
     first = size * jnp.arange(streams)
     return shards.draw(key, order, axis=1) + jnp.repeat(first, size // minibatches)
-
-
-def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
-    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
-
-    Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
-    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
-    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
-
-    Args:
-      config: With `exploration` scheduled.
-
-    Returns:
-      At least one deviation, in action units.
-    """
-    return tuple(_fall(config))
-
-
-def _fall(config: AlgoConfig) -> Iterator[float]:
-    std = config.initial_std
-    yield std
-    while std > config.std_floor:
-        lower = round(std - config.std_decrement, 4)
-        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
-        if lower == std:
-            return
-        std = config.std_floor if lower <= config.std_floor else lower
-        yield std
-
-
-def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
-    """Looks up the deviation of a control step.
-
-    Args:
-      config: With `exploration` scheduled.
-      step: [...], int32, how many control steps came before, at least 0.
-
-    Returns:
-      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
-    """
-    table = jnp.asarray(scheduled_stds(config), dtype=float)
-    return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

@@ -20,12 +20,13 @@ from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.shards import ALONE, Shards
-from swarmjax.sim import gaps, physics
+from swarmjax.sim import physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
-from swarmjax.task.episode import Ended, Robots
+from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
+from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 
 
@@ -230,20 +231,11 @@ class _Waiting(NamedTuple):
     judged: _Judged
 
 
-# The counts of `Ended`, by name, and how many numbers each has.
-_COUNTS = {
-    "episodes": 1,
-    "stage": 1,
-    "cohort": 1,
-    "targets": 1,
-    "reached": 1,
-    "all_reached": 1,
-    "steps": 1,
-    "robot_steps": 1,
-    "sensed": 1,
-    "contacts": len(gaps.KINDS),
-    "broken": 1,
-}
+# The counts of `Ended` that are one number each.
+_COUNTS = (
+    *("episodes", "stage", "cohort", "targets", "reached", "all_reached"),
+    *("steps", "robot_steps", "sensed", "broken"),
+)
 
 _Counts = tuple[Array, Ended]  # counts [A, K]; the other results [A]
 _Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
@@ -367,34 +359,18 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~came.sound).astype(jnp.int32),
         level=None if arenas.seed is None else mine(arenas.seed),
-        robots=jax.tree.map(mine, _robots(arenas)) if by_robot else None,
+        robots=jax.tree.map(mine, episodes.robots(arenas)) if by_robot else None,
     )
 
 
 def _to_counts(ended: Ended) -> _Counts:
     """Lays the counts [A, ...] of a step side by side [A, K], to write one array instead of 11."""
-    columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
-    rest = ended._replace(**dict.fromkeys(_COUNTS))
-    return jnp.concatenate(columns, axis=1), rest
+    columns = jnp.stack([getattr(ended, name) for name in _COUNTS], axis=1)
+    rest = ended._replace(contacts=None, **dict.fromkeys(_COUNTS))
+    return jnp.concatenate([columns, ended.contacts], axis=1), rest
 
 
 def _to_ended(counts: Array, rest: Ended) -> Ended:
     """Undoes `_to_counts` for all steps of a rollout, [T, A, ...]."""
-    columns, first = {}, 0
-    for name, width in _COUNTS.items():
-        columns[name] = counts[..., first] if width == 1 else counts[..., first : first + width]
-        first += width
-    return rest._replace(**columns)
-
-
-def _robots(arenas: EnvState) -> Robots:
-    """Returns the outcome for each robot, [A, R]."""
-    present, episode = arenas.level.present, arenas.episode
-    return Robots(
-        present=present,
-        reached=present & arenas.arrived,
-        reward=episode.reward,
-        robot_steps=episode.moving,
-        sensed=episode.sensed,
-        contacts=jnp.sum(episode.contacts, axis=-1),
-    )
+    columns = {name: counts[..., i] for i, name in enumerate(_COUNTS)}
+    return rest._replace(contacts=counts[..., len(_COUNTS) :], **columns)

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import gradients, networks, ppo
+from swarmjax.ppo import gradients, networks, optimizer
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -115,7 +115,7 @@ def test_act_mode_and_values_normalise_raw_observations() -> None:
 
 def test_observations_are_cut_at_ten_deviations() -> None:
     far = jnp.array([1e4, -1e4, 10.5])
-    np.testing.assert_array_equal(ppo.normalize(_fresh(), far), [10.0, -10.0, 10.0])
+    np.testing.assert_array_equal(_fresh().normalizer.normalize(far), [10.0, -10.0, 10.0])
 
 
 def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> None:
@@ -168,7 +168,7 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
     advantage = np.asarray(batch.advantage)
     inside = advantage[valid]
     minibatch = gradients.Minibatch(
-        observation=ppo.normalize(state, batch.observation)[valid],
+        observation=state.normalizer.normalize(batch.observation)[valid],
         action=batch.action[valid],
         log_prob=batch.log_prob[valid],
         advantage=jnp.asarray((inside - inside.mean()) / inside.std()),
@@ -245,7 +245,7 @@ def test_actor_and_critic_move_at_their_own_learning_rates() -> None:
     moves = _step_sizes(state.params, updated.params)
     # Adam's first step is rate * g / (|g| + 1e-5): the rate, less a share of about 1e-5 / |g|. The
     # largest |g| of each network is at least 1e-3 here, so the share is at most 1e-2.
-    rates = gradients.learning_rates(ONE_STEP, UPDATES)
+    rates = optimizer.learning_rates(ONE_STEP, UPDATES)
     np.testing.assert_allclose(moves["actor"], rates["actor"], rtol=1e-2)
     np.testing.assert_allclose(moves["critic"], rates["critic"], rtol=1e-2)
 
@@ -377,7 +377,7 @@ def test_adam_takes_its_epsilon_from_the_config() -> None:
     # A step of rate * g / (|g| + 10) is at most a tenth of the rate times the norm of g, which is
     # far below the rate itself.
     move = _step_sizes(state.params, updated.params)["critic"]
-    rate = gradients.learning_rates(config, UPDATES)["critic"]
+    rate = optimizer.learning_rates(config, UPDATES)["critic"]
     assert 0.0 < move < 0.1 * rate * float(metrics["grad_norm"])
     assert move < 0.5 * rate
 
@@ -389,7 +389,7 @@ def test_observations_may_be_left_as_they_are() -> None:
     updated, _ = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
     _assert_equal(updated.normalizer, state.normalizer)
     seen = jnp.array([4.0, -3.25, 0.5])
-    np.testing.assert_array_equal(ppo.normalize(updated, seen), seen)
+    np.testing.assert_array_equal(updated.normalizer.normalize(seen), seen)
 
 
 def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:

@@ -9,6 +9,7 @@ import learners
 import numpy as np
 import pytest
 import scipy.stats
+from flax import errors
 
 from swarmjax.ppo import gradients, networks
 from swarmjax.ppo.config import AlgoConfig
@@ -118,9 +119,9 @@ def test_actor_and_critic_share_nothing() -> None:
 
 def test_wrong_observation_size_is_refused() -> None:
     wrong = np.zeros((2, OBSERVATION + 1), np.float32)
-    with pytest.raises(AssertionError):
+    with pytest.raises(errors.ScopeParamShapeError):
         _nets().act(_params(), wrong, ())
-    with pytest.raises(AssertionError):
+    with pytest.raises(errors.ScopeParamShapeError):
         _nets().value(_params(), wrong, (), ())
 
 

@@ -6,7 +6,7 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import gradients
+from swarmjax.ppo import gradients, optimizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.gradients import Learning
 
@@ -26,19 +26,19 @@ def test_open_learning_rates_fall_with_the_gradient_steps(
     updates: int, schedule: str, actor: float
 ) -> None:
     config = AlgoConfig(epochs=1, num_minibatches=8, learning_rate_schedule=schedule)  # pyright: ignore[reportArgumentType]
-    found = gradients.learning_rates(config, updates)
+    found = optimizer.learning_rates(config, updates)
     assert found == pytest.approx({"actor": actor, "critic": actor / 0.3}, rel=1e-12)
 
 
 def test_given_learning_rates_are_kept() -> None:
     config = AlgoConfig(actor_learning_rate=1e-2)
-    found = gradients.learning_rates(config, 10**6)
+    found = optimizer.learning_rates(config, 10**6)
     assert found["actor"] == 1e-2
     assert found["critic"] < 1e-3
 
 
 def test_epochs_and_minibatches_count_as_gradient_steps() -> None:
-    assert gradients.gradient_steps(AlgoConfig(epochs=3, num_minibatches=5), 7) == 105
+    assert optimizer.gradient_steps(AlgoConfig(epochs=3, num_minibatches=5), 7) == 105
 
 
 def test_means_are_those_of_the_steps_that_were_taken() -> None:
@@ -66,7 +66,7 @@ def test_an_update_that_took_no_step_has_no_means_if_one_was_skipped() -> None:
 def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> None:
     config = AlgoConfig(epochs=1, num_minibatches=1)
     params = {"actor": {"w": jnp.ones(3)}, "critic": {"w": jnp.ones(2)}}
-    adam = gradients.make_optimizer(config, 5)
+    adam = optimizer.make(config, 5)
     learning = Learning(config, learners.nets(config, 1, 1), adam)
     progress = (params, adam.init(params))
     gradient = {"actor": {"w": jnp.array([1.0, jnp.nan, 0.0])}, "critic": {"w": jnp.ones(2)}}

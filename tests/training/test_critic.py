@@ -15,10 +15,10 @@ from flax import linen as nn
 from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
-from swarmjax.ppo import dispatch, gradients, networks, ppo
+from swarmjax.ppo import dispatch, gradients, networks
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.networks import Normalizer, Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.checkpoint import to_leaves
 from swarmjax.run.policy_export import write_policy
@@ -78,7 +78,7 @@ def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
         rollout.to_learners(x, trained.program.config.learners)
         for x in (arenas.observation, memory)
     )
-    normal = jax.vmap(ppo.normalize)(trained.learners, seen)
+    normal = jax.vmap(Normalizer.normalize)(trained.learners.normalizer, seen)
     nets = trained.program.ppo.learning.networks
     value, _ = jax.vmap(nets.value)(trained.learners.params, normal, _look(trained, arenas), mine)
     return np.asarray(value)
