@@ -365,9 +365,9 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
 
 def _to_counts(ended: Ended) -> _Counts:
     """Lays the counts [A, ...] of a step side by side [A, K], to write one array instead of 11."""
-    columns = jnp.stack([getattr(ended, name) for name in _COUNTS], axis=1)
+    columns = [getattr(ended, name)[:, None] for name in _COUNTS]
     rest = ended._replace(contacts=None, **dict.fromkeys(_COUNTS))
-    return jnp.concatenate([columns, ended.contacts], axis=1), rest
+    return jnp.concatenate([*columns, ended.contacts], axis=1), rest
 
 
 def _to_ended(counts: Array, rest: Ended) -> Ended:
