@@ -15,7 +15,7 @@ Brax differs in these points:
   has one initialisation for all of them;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
-- no compiler options for XLA (`loop.compiler_options`);
+- no compiler options for XLA (`program.compiler_options`);
 - no mask, so robots that have arrived stay in its batch (docs/adapters.md).
 
 All of Brax's robot steps count as transitions. Our trainer's transitions are only the robot steps

@@ -40,7 +40,7 @@ from swarmjax.task.env import EnvState
 from swarmjax.training import mesh, rollout, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 # Control steps per call of physics and environment: whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}

@@ -30,7 +30,7 @@ from swarmjax.config import ConfigError, Section, about
 from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.training import loop, mesh
+from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
 REPEATS = 5
@@ -80,7 +80,7 @@ def compile_program(call: Callable[[Any, Any], Any], state: Any, argument: Any) 
     """
     began = time.perf_counter()
     lowered = jax.jit(call, donate_argnums=0).lower(state, argument)
-    compiled = lowered.compile(loop.compiler_options())
+    compiled = lowered.compile(programs.compiler_options())
     seconds = time.perf_counter() - began
     memory = compiled.memory_analysis()
     assert memory is not None  # available on both CPU and GPU

@@ -23,7 +23,6 @@ from policies import Arrays, saved, several
 
 from swarmjax import epuck, policy, policy_file
 from swarmjax.policy import Policy, PolicyError
-from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
@@ -412,7 +411,7 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     names = observation.NAMES
     spread = _f32(by_name(names, infrared=0.01, distance=2.0, bearing=1e-9, other=1.0))
     batch = draw.normal(size=(64, SIZE)).astype(np.float32) * spread
-    moments = normalizer.update(learner.normalizer, jnp.asarray(batch), jnp.ones(64, bool))
+    moments = learner.normalizer.update(jnp.asarray(batch), jnp.ones(64, bool))
     learner = dataclasses.replace(learner, params=params, normalizer=moments)
     loaded = saved(tmp_path / "policy.npz", _exported(learner), activation=activation)
     # Thirty deviations reach beyond the normaliser's limit of 10.

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.ppo import batch, normalizer
+from swarmjax.ppo import batch
+from swarmjax.ppo.networks import Normalizer
 from swarmjax.shards import AXIS, Shards
 
 TWO = Shards(devices=2, streams=2)
@@ -33,8 +34,8 @@ def samples() -> tuple[np.ndarray, np.ndarray]:
 
 def test_moments_are_of_all_observations(samples: tuple[np.ndarray, np.ndarray]) -> None:
     values, valid = samples
-    begun = normalizer.init(1)
-    found = _on_two(lambda x, v: normalizer.update(begun, x[:, None], v, TWO), values, valid)
+    begun = Normalizer.init(1)
+    found = _on_two(lambda x, v: begun.update(x[:, None], v, TWO), values, valid)
     for device in range(2):
         assert found.count[device] == valid.sum()
         np.testing.assert_allclose(found.mean[device, 0], values[valid].mean(), rtol=1e-6)

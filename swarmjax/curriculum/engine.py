@@ -1,35 +1,49 @@
-"""The protocol of a curriculum, and what runs around every curriculum.
+"""The protocol of a curriculum, and how success is measured for every curriculum.
 
 A curriculum chooses the stage and the level of the next episodes, and observes how episodes ended.
 Both are pure functions of its own state, on the device. `stages.py` has the built-in modes, and
-`levels.py` replays levels of any of them. The engine measures success in cohorts
-(`cohorts.py`) for all of them.
+`levels.py` replays levels of any of them.
+
+Success is measured on each stage, without favouring short episodes. A cohort holds all episodes
+that began within one step limit. The verdict on a cohort comes one step limit after that, when the
+cohort's last episode has ended. An earlier verdict would count only the short episodes, which are
+the lucky ones. An episode counts for the stage and the cohort in which it began.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum import cohorts as cohorts_of
-from swarmjax.curriculum.cohorts import UNCOUNTED, Cohorts, CohortVerdict, Success
-from swarmjax.curriculum.config import CurriculumConfig
-from swarmjax.extension import LevelDrawing
 from swarmjax.shards import ALONE, Shards
-from swarmjax.task import stage as task_stage
 from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
-from swarmjax.task.stage_config import StageConfig
 
 STAYED, BY_THRESHOLD, BY_BUDGET, REWEIGHED = range(4)
 REASONS = ("stayed", "threshold", "budget", "reweighed")
 NEVER = np.iinfo(np.int32).max  # as a deadline
+# Cohort of an episode that does not count. Cohorts have numbers from 0, and -1 is the cohort before
+# the first.
+UNCOUNTED = -2
+# A verdict on n trials moves `fast` towards the success in these trials, by n / (n + 20) of the
+# way. The old result then counts as much as 20 trials. A few episodes then cannot outweigh many
+# earlier ones.
+_PRIOR_TRIALS = 20.0
+# Before the first verdict, these 20 trials count with a success of one half, where p (1 - p) is
+# largest.
+_PRIOR_SUCCESS = 0.5
+# A figure that was not measured. It is not NaN, because JAX_DEBUG_NANS looks for NaN.
+UNKNOWN = -math.inf
+
+Success = Literal["targets", "all"]
 
 
 class Schedule(NamedTuple):
@@ -77,6 +91,87 @@ class Next(NamedTuple):
     stage: Array
     level: Array | None = None
     replayed: Array | None = None
+
+
+class CohortTally(NamedTuple):
+    """Ended episodes of one cohort, by the stage on which they began, [S] each.
+
+    Attributes:
+      episodes: number of episodes, int32.
+      targets: robots that were present, int32.
+      reached: robots that arrived, int32.
+      complete: episodes in which every robot arrived, int32.
+      contacts: contacts of all kinds, over all robots, int32.
+      reward: sum over all robots, float32.
+    """
+
+    episodes: Array
+    targets: Array
+    reached: Array
+    complete: Array
+    contacts: Array
+    reward: Array
+
+
+class Record(NamedTuple):
+    """The record of each stage, [S] each.
+
+    Before a stage's first verdict, `episodes` is 0 and all other figures are `UNKNOWN`.
+
+    Attributes:
+      episodes: episodes of the newest verdict, int32.
+      success: share of targets that were reached in these episodes.
+      complete: share of these episodes in which every robot arrived.
+      contacts: per robot.
+      reward: per robot.
+      fast: running mean of the deciding success.
+    """
+
+    episodes: Array
+    success: Array
+    complete: Array
+    contacts: Array
+    reward: Array
+    fast: Array
+
+    def deciding(self, success: Success) -> Array:
+        """Returns the newest success [S] by a measure: of targets, or of all robots together."""
+        return {"targets": self.success, "all": self.complete}[success]
+
+
+@struct.dataclass(kw_only=True)
+class Cohorts:
+    """The measurement of all stages.
+
+    Attributes:
+      number: [] number of the cohort in which episodes now begin, int32.
+      age: [] updates since that cohort began, int32.
+      current: ended episodes of this cohort.
+      previous: ended episodes of the cohort before.
+      record: the record of each stage.
+    """
+
+    number: Array
+    age: Array
+    current: CohortTally
+    previous: CohortTally
+    record: Record
+
+
+class CohortVerdict(NamedTuple):
+    """The findings of an update.
+
+    Attributes:
+      over: [] whether a cohort is over. All episodes of the cohort before it have then ended.
+      judged: [S] whether the cohort before had episodes on the stage; all False unless `over`.
+      success: [S] deciding success of each stage's newest verdict; `UNKNOWN` before the first.
+      record: the record of each stage.
+    """
+
+    over: Array
+    judged: Array
+    success: Array
+    record: Record
 
 
 class CurriculumOutcomes(NamedTuple):
@@ -130,43 +225,6 @@ class CurriculumState:
         return self.own.chosen
 
 
-def schedule(
-    stages: Sequence[StageConfig],
-    options: CurriculumConfig,
-    *,
-    updates: int,
-    step_limit: int,
-    rollout: int,
-    drawings: Sequence[LevelDrawing] = (),
-) -> Schedule:
-    """Computes the curriculum's numbers.
-
-    The stages before the last share `budget_share` of the updates in equal parts.
-
-    Args:
-      stages: S, in order.
-      options: settings of the curriculum.
-      updates: updates of the whole run.
-      step_limit: most control steps of an episode.
-      rollout: control steps of an update.
-      drawings: an extension's ways of drawing levels.
-
-    Returns:
-      The numbers, an argument of the compiled program.
-    """
-    share = options.budget_share * updates / max(len(stages) - 1, 1)
-    deadline = [math.ceil(share * (i + 1)) for i in range(len(stages) - 1)]
-    if options.mode not in ("sequential", "mixed"):
-        deadline = [NEVER] * len(deadline)
-    return Schedule(
-        stages=task_stage.stack(stages, drawings),
-        deadline=np.array([*deadline, NEVER], np.int32),
-        threshold=np.float32(options.threshold),
-        floor=np.float32(options.floor),
-        cohort_updates=np.int32(math.ceil(step_limit / rollout)),
-    )
-
-
 def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
     """Starts a curriculum.
 
@@ -177,7 +235,7 @@ def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
     Returns:
       The state before the first update.
     """
-    own, cohorts = curriculum.init(), cohorts_of.init(schedule.deadline.shape[0])
+    own, cohorts = curriculum.init(), init_cohorts(schedule.deadline.shape[0])
     return CurriculumState(own=own, cohorts=cohorts, met=_robots(own.chosen, schedule))
 
 
@@ -229,16 +287,127 @@ def observe(
     Returns:
       The state for the next update.
     """
-    counted = cohorts_of.count(state.cohorts, ended, shards)
-    judged, verdict = cohorts_of.judge(counted, schedule.cohort_updates, success)
+    counted = count(state.cohorts, ended, shards)
+    judged, verdict = judge(counted, schedule.cohort_updates, success)
     every, loss = jax.tree.map(partial(shards.gather, axis=1), (ended, value_loss))
     outcomes = CurriculumOutcomes(every, loss, verdict, update)
     own = curriculum.observe(state.own, outcomes)
     return CurriculumState(
         own=own,
-        cohorts=cohorts_of.begin(judged, verdict.over | (own.chosen.reason != STAYED)),
+        cohorts=begin_cohort(judged, verdict.over | (own.chosen.reason != STAYED)),
         met=jnp.maximum(state.met, _robots(own.chosen, schedule)),
     )
+
+
+def init_cohorts(stages: int) -> Cohorts:
+    """Returns the measurement of S stages before the first episode."""
+    zero, unknown = jnp.zeros((), jnp.int32), jnp.full(stages, UNKNOWN, jnp.float32)
+    return Cohorts(
+        number=zero,
+        age=zero,
+        current=_no_episodes(stages),
+        previous=_no_episodes(stages),
+        record=Record(jnp.zeros(stages, jnp.int32), *[unknown] * 5),
+    )
+
+
+def no_verdict(stages: int) -> CohortVerdict:
+    """Returns what is known of S stages before the first update."""
+    record = init_cohorts(stages).record
+    return CohortVerdict(jnp.array(True), jnp.zeros(stages, bool), record.success, record)
+
+
+def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
+    """Adds ended episodes to the cohort and the stage in which they began.
+
+    Args:
+      cohorts: before.
+      ended: [T, A]; only episodes of the last two cohorts count.
+      shards: how the arenas are spread over devices.
+
+    Returns:
+      The measurement with new tallies.
+    """
+    chex.assert_rank(ended.cohort, 2)
+    chex.assert_equal_shape([ended.cohort, ended.stage, ended.targets, ended.reached])
+    return replace(
+        cohorts,
+        current=_add(cohorts.current, ended, cohorts.number, shards),
+        previous=_add(cohorts.previous, ended, cohorts.number - 1, shards),
+    )
+
+
+def judge(
+    cohorts: Cohorts, updates: Array | np.int32, success: Success
+) -> tuple[Cohorts, CohortVerdict]:
+    """Ends an update; if a cohort is over, records the one before.
+
+    Args:
+      cohorts: after `count`.
+      updates: [] updates of a cohort, int32.
+      success: which success the running mean follows.
+
+    Returns:
+      The measurement with the new record, and the verdict.
+    """
+    age = cohorts.age + 1
+    over = age >= updates
+    judged = over & (cohorts.previous.targets > 0)
+    record = _record(cohorts.record, cohorts.previous, judged, success)
+    verdict = CohortVerdict(over, judged, record.deciding(success), record)
+    return replace(cohorts, age=age, record=record), verdict
+
+
+def begin_cohort(cohorts: Cohorts, begins: Array) -> Cohorts:
+    """Begins a new cohort where `begins` [] is true."""
+    empty = _no_episodes(cohorts.record.success.shape[0])
+    following = (cohorts.current, empty)
+    tallies = (cohorts.previous, cohorts.current)
+    previous, current = jax.tree.map(lambda a, b: jnp.where(begins, a, b), following, tallies)
+    return replace(
+        cohorts,
+        number=cohorts.number + begins,
+        age=jnp.where(begins, 0, cohorts.age),
+        previous=previous,
+        current=current,
+    )
+
+
+def _no_episodes(stages: int) -> CohortTally:
+    zero = jnp.zeros(stages, jnp.int32)
+    return CohortTally(zero, zero, zero, zero, zero, jnp.zeros(stages, jnp.float32))
+
+
+def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> CohortTally:
+    """Adds the episodes of one cohort to its tally."""
+    stages = jnp.arange(tally.episodes.shape[0])[:, None, None]
+    mine = (ended.cohort == cohort) & (ended.stage == stages)  # [S, T, A]
+
+    def total(x: Array) -> Array:
+        return jnp.sum(jnp.where(mine, x, 0), axis=(1, 2))
+
+    contacts = jnp.sum(ended.contacts, axis=-1)
+    counts = (ended.episodes, ended.targets, ended.reached, ended.all_reached, contacts)
+    new = CohortTally(*map(total, (*counts, ended.reward)))
+    return CohortTally(*(a + b for a, b in zip(tally, shards.sum(new), strict=True)))
+
+
+def _record(record: Record, tally: CohortTally, judged: Array, success: Success) -> Record:
+    """Records a whole cohort for the stages [S] on which it had episodes."""
+    robots, episodes = jnp.maximum(tally.targets, 1), jnp.maximum(tally.episodes, 1)
+    newest = Record(
+        episodes=tally.episodes,
+        success=tally.reached / robots,
+        complete=tally.complete / episodes,
+        contacts=tally.contacts / robots,
+        reward=tally.reward / robots,
+        fast=record.fast,
+    )
+    trials = {"targets": tally.targets, "all": tally.episodes}[success]
+    mean = jnp.where(jnp.isfinite(record.fast), record.fast, _PRIOR_SUCCESS)
+    rate = trials / (trials + _PRIOR_TRIALS)
+    newest = newest._replace(fast=mean + rate * (newest.deciding(success) - mean))
+    return jax.tree.map(lambda new, old: jnp.where(judged, new, old), newest, record)
 
 
 def _robots(chosen: StageChoice, schedule: Schedule) -> Array:

@@ -20,9 +20,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.config import CurriculumConfig
-from swarmjax.curriculum.engine import Curriculum, CurriculumOutcomes, Next, StageChoice
+from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, CurriculumOutcomes, Next, StageChoice
 from swarmjax.task.episode import Ended
 
 _EMPTY = -1.0  # score of an empty place, below every real score

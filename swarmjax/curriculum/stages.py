@@ -5,7 +5,7 @@ stage, the share of the arenas on each stage, and the reason. A mode is also cal
 update, without verdicts, and then returns where a run begins.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -13,20 +13,25 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum import cohorts
-from swarmjax.curriculum.cohorts import CohortVerdict, Record
+from swarmjax.config.foreign_code import explained
+from swarmjax.curriculum import levels
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
     BY_THRESHOLD,
     REWEIGHED,
     STAYED,
+    CohortVerdict,
     Curriculum,
     CurriculumOutcomes,
     Next,
+    Record,
     Schedule,
     StageChoice,
+    no_verdict,
 )
+from swarmjax.extension import OwnCurriculum
+from swarmjax.task import extended
 
 _EARLIER = 0.2  # share of the arenas on earlier stages with `mixed`: this project's choice
 _UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
@@ -53,23 +58,36 @@ class StagesState:
 Mode = Callable[[StagesState, Schedule, CurriculumConfig, CohortVerdict, Array], StageChoice]
 
 
-def make(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
-    """Makes a curriculum over stages.
+def make(
+    schedule: Schedule, options: CurriculumConfig, own: Sequence[OwnCurriculum] = ()
+) -> Curriculum:
+    """Makes the curriculum that the settings mean.
 
     Args:
       schedule: the curriculum's numbers.
       options: settings of the curriculum.
-
-    Returns:
-      The curriculum; it chooses no levels.
+      own: curricula of an extension.
     """
+    piece = {each.name: each for each in own}.get(options.mode)
+    if piece is None:
+        by_stage = _of_mode(schedule, options)
+    else:
+        guard = explained(f"{extended.label(piece)} fails")
+        by_stage = Curriculum(*map(guard, guard(piece.function)(schedule)))
+    if options.levels == "none":
+        return by_stage
+    return levels.make(by_stage, schedule.deadline.shape[0], options)
+
+
+def _of_mode(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
+    """Makes a built-in curriculum over stages, which chooses no levels."""
     mode, stages = MODES[options.mode], schedule.deadline.shape[0]
 
     def init() -> StagesState:
         zero = jnp.zeros((), jnp.int32)
         nothing = StageChoice(zero, jnp.zeros(stages), zero)
         blank = StagesState(chosen=nothing, turn=zero, since=zero)
-        chosen = mode(blank, schedule, options, cohorts.no_verdict(stages), zero - 1)
+        chosen = mode(blank, schedule, options, no_verdict(stages), zero - 1)
         return replace(blank, chosen=chosen)
 
     def choose(state: StagesState, key: Array, free: tuple[int, int]) -> Next:

@@ -94,8 +94,21 @@ def make(
     Returns:
       A groups with T * N samples.
     """
-    estimate = {"gae": _bootstrapped, "monte_carlo": _monte_carlo}[config.advantage]
-    advantages, returns = estimate(trajectory, config, shards)
+    if config.advantage == "gae":
+        advantages, returns = generalized_advantages(
+            trajectory.reward,
+            trajectory.value,
+            trajectory.next_value,
+            trajectory.terminated,
+            trajectory.truncated,
+            discount=config.discount,
+            gae_lambda=config.gae_lambda,
+        )
+    else:
+        boundary = trajectory.terminated | trajectory.truncated
+        returns = monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
+        returns = normalize_returns(returns, trajectory.valid, shards)
+        advantages = returns - trajectory.value
 
     def group(x: jax.Array) -> jax.Array:
         x = jnp.moveaxis(x, 0, 1)
@@ -145,31 +158,6 @@ def value_loss(batch: Batch, over: jax.Array) -> jax.Array:
     return jax.lax.scan(step, (none, none), (positive, valid, over))[1]
 
 
-def _bootstrapped(
-    trajectory: Trajectory, config: AlgoConfig, _: Shards
-) -> tuple[jax.Array, jax.Array]:
-    """Returns the advantages and returns of generalised advantage estimation."""
-    return generalized_advantages(
-        trajectory.reward,
-        trajectory.value,
-        trajectory.next_value,
-        trajectory.terminated,
-        trajectory.truncated,
-        discount=config.discount,
-        gae_lambda=config.gae_lambda,
-    )
-
-
-def _monte_carlo(
-    trajectory: Trajectory, config: AlgoConfig, shards: Shards
-) -> tuple[jax.Array, jax.Array]:
-    """Returns the normalised Monte-Carlo returns less the values, and the returns themselves."""
-    boundary = trajectory.terminated | trajectory.truncated
-    returns = monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
-    normal = normalize_returns(returns, trajectory.valid, shards)
-    return normal - trajectory.value, normal
-
-
 def generalized_advantages(
     rewards: jax.Array,
     values: jax.Array,
@@ -203,17 +191,7 @@ def generalized_advantages(
     terminated = terminated.astype(bool)
     ends = terminated | truncated.astype(bool)
     errors = rewards + discount * jnp.where(terminated, 0.0, next_values) - values
-
-    def accumulate(
-        following: jax.Array, step: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
-        error, end = step
-        advantage = error + discount * gae_lambda * jnp.where(end, 0.0, following)
-        return advantage, advantage
-
-    _, advantages = jax.lax.scan(
-        accumulate, jnp.zeros_like(errors[0]), (errors, ends), reverse=True
-    )
+    advantages = _sum_back(errors, ends, discount * gae_lambda)
     return advantages, advantages + values
 
 
@@ -235,18 +213,18 @@ def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: flo
       The returns, [T, ...].
     """
     chex.assert_equal_shape([reward, boundary])
+    return _sum_back(reward, boundary.astype(bool), discount)
 
-    def accumulate(
-        following: jax.Array, step: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
-        earned, end = step
-        total = earned + discount * jnp.where(end, 0.0, following)
+
+def _sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
+    """Adds to each term [T, ...] the factor times the sum of the step after, up to an end."""
+
+    def add(following: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        term, end = step
+        total = term + factor * jnp.where(end, 0.0, following)
         return total, total
 
-    _, returns = jax.lax.scan(
-        accumulate, jnp.zeros_like(reward[0]), (reward, boundary.astype(bool)), reverse=True
-    )
-    return returns
+    return jax.lax.scan(add, jnp.zeros_like(terms[0]), (terms, ends), reverse=True)[1]
 
 
 def normalize_returns(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> jax.Array:

@@ -3,16 +3,14 @@
 import importlib
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Literal
 
 import jax
 
 from swarmjax.config import ConfigError, show
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.networks import Networks, Sizes
-from swarmjax.ppo.optimizer import Learning, Progress
 
 # XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
 _LEAST_GENERATION = 8
@@ -77,32 +75,22 @@ def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
         return False
     if sizes.hearing is not None:  # the kernels support no layer in front of the hidden ones
         return False
-    possible, own = _has_tensor_cores(), networks.actor.torso is not None
-    fitting = possible and not own and _fits(config, sizes)
+    possible = _has_tensor_cores()
+    fitting = possible and networks.actor.torso is None and _fits(config, sizes)
     if config.update_backend == "fused" and not possible:
         raise ConfigError(
             "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability "
             f"{_LEAST_GENERATION} or more: give auto or autodiff."
         )
     if config.update_backend == "fused" and not fitting:
-        raise _unfit(config, sizes, own=own)
+        raise ConfigError(
+            "algo.update_backend is fused, but the kernels do not support algo.hidden_sizes "
+            f"{show(config.hidden_sizes)} with {sizes.observation} observed numbers: give two "
+            "layers of 16, 32 or 64 and at most 128 numbers, or algo.update_backend=auto."
+        )
     if config.update_backend == "auto" and _is_full_precision():
         return False
     return fitting
-
-
-def _unfit(config: AlgoConfig, sizes: Sizes, *, own: bool) -> ConfigError:
-    """Builds the error that names what does not fit the chip: the layers or the observation."""
-    if not own and not _fits(replace(config, hidden_sizes=(16, 16)), sizes):
-        return ConfigError(
-            f"algo.update_backend is fused, but {sizes.observation} numbers are observed, more "
-            "than the kernels support: give fewer task.observations, or algo.update_backend=auto."
-        )
-    return ConfigError(
-        f"algo.update_backend is fused, but algo.hidden_sizes is {show(config.hidden_sizes)}, "
-        "which the kernels do not support: give two layers of 16, 32 or 64, or "
-        "algo.update_backend=auto."
-    )
 
 
 def _fits(config: AlgoConfig, sizes: Sizes) -> bool:

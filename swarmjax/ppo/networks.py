@@ -1,4 +1,4 @@
-"""Actor and critic networks.
+"""Actor and critic networks, and the running moments that normalise what they see.
 
 B stands for any number of leading axes, O for the observation and U for the action.
 """
@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
+from flax import struct
 
-from swarmjax.config import ConfigError
-from swarmjax.config.foreign_code import explained
 from swarmjax.extension import Network
-from swarmjax.ppo.config import AlgoConfig, resolve
+from swarmjax.ppo import own_network
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall, uniform
+from swarmjax.shards import ALONE, Shards
 
 Params = dict[str, Any]
 
@@ -32,6 +33,11 @@ _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 # "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
+# An observation that has hardly varied yet is magnified by at most 1 / this.
+MIN_STD = 1e-3
+# Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
+# continuous-action detail 7: bound of normalised observations.
+OBSERVATION_LIMIT = 10.0
 
 
 class Hearing(NamedTuple):
@@ -64,6 +70,101 @@ class Sizes(NamedTuple):
     action: int
     state: int = 0
     hearing: Hearing | None = None
+
+
+@struct.dataclass(kw_only=True)
+class Normalizer:
+    """Mean and variance of the observations seen so far.
+
+    Brax's `running_statistics` loads MuJoCo, MJX and Warp. It also divides 0 by 0 if the first
+    batch has no valid sample, which happens to a learner whose robots are still absent.
+
+    Attributes:
+      count: [], float32, number of observations. Beyond 2**24 it is rounded. This is harmless,
+        because the count only weighs a batch against the past, and a relative error of 2**-24 is
+        negligible.
+      mean: [O].
+      variance: [O], of the population; 1 before the first observation.
+      rest: [2, O], what rounding to float32 has taken from mean and variance. After a million
+        updates, a batch moves them by less than float32 can hold.
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+    rest: jax.Array
+
+    @property
+    def std(self) -> jax.Array:
+        """Standard deviation to divide by, [O], at least 1e-3."""
+        return jnp.maximum(jnp.sqrt(self.variance), MIN_STD)
+
+    @classmethod
+    def init(cls, observation_size: int) -> "Normalizer":
+        """Returns a new normalizer, which changes nothing yet."""
+        return cls(
+            count=jnp.zeros((), jnp.float32),
+            mean=jnp.zeros((observation_size,), jnp.float32),
+            variance=jnp.ones((observation_size,), jnp.float32),
+            rest=jnp.zeros((2, observation_size), jnp.float32),
+        )
+
+    def normalize(self, observation: jax.Array) -> jax.Array:
+        """Shifts and scales observations [..., O] to mean 0 and deviation 1, within +-10."""
+        chex.assert_axis_dimension(observation, -1, self.mean.shape[-1])
+        scaled = (observation - self.mean) / self.std
+        return jnp.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+    def update(
+        self, observation: jax.Array, valid: jax.Array, shards: Shards = ALONE
+    ) -> "Normalizer":
+        """Adds a batch of observations.
+
+        It merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for
+        Computing the Sample Variance: Analysis and Recommendations". The batch's own moments take
+        two passes, which avoids subtracting large squares.
+
+        Args:
+          observation: [..., O]; may hold anything, NaN included, where not valid.
+          valid: [...], bool or 0/1, the observations to count.
+          shards: how the observations are spread over devices.
+
+        Returns:
+          The moments of all observations; unchanged if none is valid.
+        """
+        chex.assert_shape(observation, (*valid.shape, *self.mean.shape))
+        axes = tuple(range(valid.ndim))
+        keep = valid.astype(bool)[..., None]
+        batch_count = shards.sum(jnp.sum(keep, dtype=jnp.float32))
+        divisor = jnp.maximum(batch_count, 1.0)
+        batch_mean = shards.sum(jnp.sum(jnp.where(keep, observation, 0.0), axis=axes)) / divisor
+        deviation = jnp.where(keep, observation - batch_mean, 0.0)
+        batch_variance = shards.sum(jnp.sum(deviation**2, axis=axes)) / divisor
+
+        count = self.count + batch_count
+        share = batch_count / jnp.maximum(count, 1.0)
+        shift = batch_mean - self.mean
+        spread = batch_variance + (1.0 - share) * shift**2
+        # The first batch replaces the variance of 1, from which a small one would lose digits.
+        before = jnp.where(share == 1.0, spread, self.variance)
+        mean, mean_rest = _add(self.mean, share * shift + self.rest[0])
+        variance, variance_rest = _add(before, share * (spread - before) + self.rest[1])
+        return Normalizer(
+            count=count,
+            mean=mean,
+            variance=jnp.maximum(variance, 0.0),  # rounding may leave less
+            rest=jnp.stack([mean_rest, variance_rest]),
+        )
+
+
+def _add(total: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Adds two numbers; also returns what rounding takes from the sum.
+
+    Together, both are exact: Knuth, "The Art of Computer Programming" 2, section 4.2.2, theorem B.
+    """
+    new = total + change
+    taken = new - total
+    return new, (total - (new - taken)) + (change - taken)
 
 
 class _Torso(nn.Module):
@@ -283,7 +384,6 @@ class Networks(NamedTuple):
           know about its surroundings (Mirowski et al. 2017, "Learning to Navigate in Complex
           Environments", section 3).
         """
-        self._check(params["actor"], observation)
         output = self.actor.apply({"params": params["actor"]}, observation, memory, begins)
         return cast("Acted", output)
 
@@ -307,14 +407,8 @@ class Networks(NamedTuple):
         Returns:
           The expected discounted return, [B] or [T, B], and the memory after.
         """
-        self._check(params["critic"], observation)
         output = self.critic.apply({"params": params["critic"]}, observation, state, memory, begins)
         return cast("tuple[jax.Array, Any]", output)
-
-    def _check(self, network: Params, observation: jax.Array) -> None:
-        """Checks an observation's size for the hidden layers; other networks check it alone."""
-        if self.actor.torso is None:
-            chex.assert_axis_dimension(observation, -1, self.actor.sizes.observation)
 
 
 def make(
@@ -334,31 +428,6 @@ def make(
     Raises:
       ConfigError: the network is missing, or does not return features.
     """
-    name = resolve(config, pieces)
-    torso = {piece.name: piece.function for piece in pieces}.get(name)
-    if torso is not None:
-        _check_torso(torso, name, sizes.observation)
-        if sizes.state:
-            whose = f"{name} for a critic of the state"
-            _check_torso(torso, whose, sizes.observation + sizes.state)
+    torso = own_network.load(config, pieces, sizes.observation, sizes.state)
     parts = (config, sizes, torso, kernels)
     return Networks(_Actor(*parts), _Critic(*parts))
-
-
-def _check_torso(torso: Any, name: str, observation_size: int) -> None:
-    """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
-    seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
-    where = f"network {name}"
-    with explained(f"{where} fails"):
-        made = torso()
-        found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
-    other = sorted(set(variables) - {"params"})
-    if other:
-        raise ConfigError(f"{where} keeps {', '.join(other)}: a network may keep only params.")
-    shape = getattr(found, "shape", ())
-    if len(shape) != 2 or shape[0] != 3 or found.dtype != jnp.float32:
-        kind = getattr(found, "dtype", type(found).__name__)
-        raise ConfigError(
-            f"{where} turns float32 [3, {observation_size}] into {kind} {list(shape)}: return "
-            "float32 [3, F], the features that the heads take."
-        )

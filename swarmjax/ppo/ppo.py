@@ -7,7 +7,7 @@ groups.
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,15 +20,13 @@ from flax import struct
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.extension import Network
 from swarmjax.ppo import batch as batches
-from swarmjax.ppo import dispatch, losses, networks, normalizer, optimizer
+from swarmjax.ppo import dispatch, exploration, gradients, networks, optimizer
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.memory import NO_MEMORY, Recall
-from swarmjax.ppo.networks import Params, Sizes
-from swarmjax.ppo.normalizer import Normalizer
-from swarmjax.ppo.optimizer import Learning, Progress
+from swarmjax.ppo.networks import Normalizer, Params, Sizes
 from swarmjax.shards import ALONE, Shards
 
 _ADVANTAGE_EPSILON = 1e-8
@@ -109,7 +107,7 @@ class PPO:
         return LearnerState(
             params=params,
             optimizer_state=self.learning.optimizer.init(params),
-            normalizer=normalizer.init(self.sizes.observation),
+            normalizer=Normalizer.init(self.sizes.observation),
             explored=jnp.zeros((), jnp.int32) if scheduled else None,
         )
 
@@ -132,11 +130,11 @@ class PPO:
           The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
           after.
         """
-        seen = normalize(learner, observation)
+        seen = learner.normalizer.normalize(observation)
         acted = self.learning.networks.act(learner.params, seen, memory)
         chex.assert_equal_shape([acted.mean, noise])
         action = acted.mean + acted.std * noise
-        return action, losses.log_density(acted.mean, acted.std, action), acted.memory
+        return action, gradients.log_density(acted.mean, acted.std, action), acted.memory
 
     def value(
         self, learner: LearnerState, observation: jax.Array, state: Any = (), memory: Any = ()
@@ -153,7 +151,7 @@ class PPO:
         Returns:
           The expected discounted return, [...], and the memory after.
         """
-        seen = normalize(learner, observation)
+        seen = learner.normalizer.normalize(observation)
         return self.learning.networks.value(learner.params, seen, state, memory)
 
     def batch(self, trajectory: Trajectory, memory: Recall, over: jax.Array) -> Batch:
@@ -186,7 +184,7 @@ class PPO:
 
         Returns:
           The state after, the same on all devices, and metrics, each []. The metrics of
-          `losses.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
+          `gradients.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
           `skipped_steps` counts the steps that were not finite. `std` is the policy's mean
           deviation after the update.
         """
@@ -201,11 +199,11 @@ class PPO:
         # Without a finite sample no step is finite either.
         lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
         metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
-        metrics = optimizer.mean_of_taken(metrics)
+        metrics = gradients.mean_of_taken(metrics)
         metrics["std"] = jnp.mean(jnp.exp(params["actor"]["log_std"]))
         moments = learner.normalizer
         if config.normalize_observations:
-            moments = normalizer.update(moments, batch.observation, batch.valid, shards)
+            moments = moments.update(batch.observation, batch.valid, shards)
             moments = _leave_neighbours(moments, self.sizes)
         return replace(
             learner, params=params, optimizer_state=optimizer_state, normalizer=moments
@@ -226,7 +224,7 @@ class PPO:
             return learner
         # The count stays at its largest value, since a run may go on from another one's count.
         explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
-        std = scheduled_std(self.config, explored - 1)
+        std = exploration.scheduled_std(self.config, explored - 1)
         return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
 
     def explore_anew(self, learner: LearnerState) -> LearnerState:
@@ -239,11 +237,6 @@ def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerS
     actor = learner.params["actor"]
     actor = actor | {"log_std": jnp.full_like(actor["log_std"], log_std)}
     return replace(learner, params=learner.params | {"actor": actor})
-
-
-def normalize(learner: LearnerState, observation: jax.Array) -> jax.Array:
-    """Normalises raw observations [..., O] for the networks, within +-10."""
-    return normalizer.normalize(learner.normalizer, observation)
 
 
 def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
@@ -281,7 +274,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
     if config.advantage == "gae":
         advantage = _normalize_advantages(advantage, valid, shards)
     samples = Minibatch(
-        observation=normalize(learner, batch.observation),
+        observation=learner.normalizer.normalize(batch.observation),
         action=batch.action,
         log_prob=batch.log_prob,
         advantage=advantage,
@@ -314,10 +307,10 @@ def _learn(
 
     def step(progress: Progress, rows: jax.Array) -> tuple[Progress, Metrics]:
         minibatch = _gather(samples, rows, config)
-        gradient = jax.grad(losses.ppo_loss, has_aux=True)(
+        gradient = jax.grad(gradients.ppo_loss, has_aux=True)(
             progress[0], minibatch, learning.networks, config, expected_valid
         )
-        return optimizer.take(learning, progress, gradient, jnp.any(minibatch.valid))
+        return gradients.take(learning, progress, gradient, jnp.any(minibatch.valid))
 
     # Whole groups are shuffled, because they are faster to gather than single samples.
     groups, keys = samples.valid.shape[0], jax.random.split(key, config.epochs)
@@ -349,45 +342,3 @@ def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> j
 
     first = size * jnp.arange(streams)
     return shards.draw(key, order, axis=1) + jnp.repeat(first, size // minibatches)
-
-
-def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
-    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
-
-    Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
-    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
-    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
-
-    Args:
-      config: With `exploration` scheduled.
-
-    Returns:
-      At least one deviation, in action units.
-    """
-    return tuple(_fall(config))
-
-
-def _fall(config: AlgoConfig) -> Iterator[float]:
-    std = config.initial_std
-    yield std
-    while std > config.std_floor:
-        lower = round(std - config.std_decrement, 4)
-        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
-        if lower == std:
-            return
-        std = config.std_floor if lower <= config.std_floor else lower
-        yield std
-
-
-def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
-    """Looks up the deviation of a control step.
-
-    Args:
-      config: With `exploration` scheduled.
-      step: [...], int32, how many control steps came before, at least 0.
-
-    Returns:
-      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
-    """
-    table = jnp.asarray(scheduled_stds(config), dtype=float)
-    return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

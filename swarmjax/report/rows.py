@@ -45,8 +45,11 @@ def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
 
 
 WHOLE = ValueKind("whole number", lambda value: _is_number(value, int, 2**63 - 1))  # as NumPy holds
+COUNT = ValueKind("whole number", lambda value: WHOLE.fits(value) and value >= 0)
 NUMBER = ValueKind("number", lambda value: _is_number(value, int | float, _LARGEST))
 NUMBER_OR_NULL = ValueKind("number", lambda value: value is None or NUMBER.fits(value))
+NAME = ValueKind("name", lambda value: isinstance(value, str))
+FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
 MAP = ValueKind("keys and values", lambda value: isinstance(value, dict))
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from swarmjax import provenance
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.run.settings import TrainConfig
-from swarmjax.training import loop, mesh, seeds
+from swarmjax.training import mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any)
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     lowered = mesh.jit_chunk(program).lower(schedule, part, np.int32(1))
     fixed = program.config.run.deterministic
-    call = lowered.compile(loop.compiler_options(deterministic=fixed))
+    call = lowered.compile(programs.compiler_options(deterministic=fixed))
     needed = call.memory_analysis()
     assert needed is not None  # both CPU and GPU report it
     # The returned state reuses the memory of the donated state. Only the metrics need more memory.

@@ -8,8 +8,8 @@ import numpy as np
 
 from swarmjax import epuck, extension, policy_file, provenance
 from swarmjax.config import inherit, to_dict
-from swarmjax.ppo import normalizer
 from swarmjax.ppo.config import AlgoConfig
+from swarmjax.ppo.networks import MIN_STD, OBSERVATION_LIMIT
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import Leaves
 from swarmjax.run.settings import TrainConfig
@@ -39,7 +39,7 @@ def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:
         if name.startswith(prefix) and not name.startswith(prefix + "guess/")  # only for training
     }
     mean, variance = (leaves[f"learners/normalizer/{name}"] for name in ("mean", "variance"))
-    std = np.maximum(np.sqrt(variance), normalizer.MIN_STD)
+    std = np.maximum(np.sqrt(variance), MIN_STD)
     return actor | {"normalizer/mean": mean, "normalizer/std": std}
 
 
@@ -74,7 +74,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         "policy": algo.policy,
         "learners": trained.learners,
         "activation": algo.activation,
-        "observation": described | {"limit": normalizer.OBSERVATION_LIMIT},
+        "observation": described | {"limit": OBSERVATION_LIMIT},
         "action": {
             "names": list(policy_file.ACTION_NAMES),
             "units": list(policy_file.ACTION_UNITS),

@@ -12,7 +12,7 @@ from swarmjax.run.directory import DECISIONS, METRICS, SUMMARY, Row
 from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 
 def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int) -> None:

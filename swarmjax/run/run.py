@@ -46,7 +46,7 @@ from swarmjax.sim import physics
 from swarmjax.training import episodes, mesh
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
 # There is a checkpoint at least after this share of the budget, so that a short run has some too.

@@ -11,7 +11,7 @@ from swarmjax.run.directory import Row
 from swarmjax.run.display import spread
 from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 
 def first(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from swarmjax.task.env import EnvState
 from swarmjax.task.episode import Ended, Robots
 from swarmjax.training.config import STEPS_PER_EPISODE, ProgramConfig
 
@@ -55,6 +56,19 @@ def room(config: ProgramConfig) -> int:
 def rows_of_call(config: ProgramConfig) -> int:
     """Returns for how many updates of each seed a call may return episodes."""
     return max(1, MOST_HELD // (room(config) * config.seeds))
+
+
+def robots(arenas: EnvState) -> Robots:
+    """Returns the outcome for each robot, [A, R]."""
+    present, episode = arenas.level.present, arenas.episode
+    return Robots(
+        present=present,
+        reached=present & arenas.arrived,
+        reward=episode.reward,
+        robot_steps=episode.moving,
+        sensed=episode.sensed,
+        contacts=jnp.sum(episode.contacts, axis=-1),
+    )
 
 
 def pack(ended: Ended, size: int) -> EpisodeLog:

@@ -24,15 +24,7 @@ from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
 from swarmjax.training import episodes, rollout
 from swarmjax.training.config import ProgramConfig
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
-
-# XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
-# the next. A step of 8,192 arenas thus took 542 us instead of 606 us on an H100
-# (docs/performance.md).
-_GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
-# XLA then does not choose kernels by timing them, and uses no kernel that adds in a varying order.
-_DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
+from swarmjax.training.rollout import Arena, Program
 
 Metrics = dict[str, Any]
 
@@ -122,13 +114,13 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     """
     config, shards = program.config, program.shards
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=config.waiting)
+    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=program.waiting)
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
-    batch = rollout.batch(program, trajectory, state.arenas.recall, ended, config.learners)
+    batch = rollout.batch(program, trajectory, state.arenas.recall, ended)
     explored = rollout.explore(program, state.learners, config.algo.rollout_length)
-    learn_keys = jax.random.split(learn_key, config.learners)
+    learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
     curriculum = curricula.observe(
         program.curriculum(schedule),
@@ -189,7 +181,7 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    if program.config.learners > 1:
+    if len(learners.normalizer.count) > 1:
         carried = _copied(carried, before.met, after.met)
     if options.optimizer == "reset":
         carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
@@ -282,29 +274,10 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
         return jnp.sum(jnp.where(keep, x, 0), axis=(0, 1))
 
     contacts = total(ended.contacts)
+    sums = ("episodes", "targets", "reached", "steps", "robot_steps", "sensed", "reward")
     return {
-        "episodes": total(ended.episodes),
-        "targets": total(ended.targets),
-        "reached": total(ended.reached),
+        **{name: total(getattr(ended, name)) for name in sums},
         "complete": total(ended.all_reached),
-        "steps": total(ended.steps),
-        "robot_steps": total(ended.robot_steps),
-        "sensed": total(ended.sensed),
-        "reward": total(ended.reward),
         **{f"contacts_{kind}": contacts[i] for i, kind in enumerate(gaps.KINDS)},
         "broken_arenas": jnp.sum(ended.broken),
     }
-
-
-def compiler_options(*, deterministic: bool = False) -> dict[str, str | bool]:
-    """Returns XLA's options for loops like this one on JAX's current device.
-
-    Args:
-      deterministic: Whether a GPU must compute the same bits each time. A CPU always does.
-
-    Returns:
-      Values of XLA's options, by name.
-    """
-    if jax.default_backend() != "gpu":
-        return {}
-    return _GPU_OPTIONS | (_DETERMINISTIC if deterministic else {})

@@ -22,7 +22,8 @@ from swarmjax.sim.physics import PhysicsState
 from swarmjax.training import loop, seeds
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program, side_by_side
+from swarmjax.training.program import side_by_side
+from swarmjax.training.rollout import Program
 
 _ALL: Any = PartitionSpec()
 _SEEDS: Any = PartitionSpec("seeds")

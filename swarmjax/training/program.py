@@ -1,70 +1,32 @@
-"""The compiled program of a run: everything that is fixed before the run starts."""
+"""Builds the compiled program of a run from its settings."""
 
-from dataclasses import dataclass
+import math
 
 import jax
+import numpy as np
 
 from swarmjax import extension
-from swarmjax.config.foreign_code import explained
-from swarmjax.curriculum import engine as curricula
-from swarmjax.curriculum import levels
-from swarmjax.curriculum import stages as stage_modes
-from swarmjax.curriculum.engine import Curriculum, Schedule
+from swarmjax.curriculum.engine import NEVER, Schedule
 from swarmjax.ppo.networks import Hearing, Sizes
 from swarmjax.ppo.ppo import PPO
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
-from swarmjax.task import env, extended, surroundings
+from swarmjax.task import env, surroundings
+from swarmjax.task import stage as task_stage
 from swarmjax.task.config import NEIGHBOUR_SIZE
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
+from swarmjax.training.rollout import Program
 
+# XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
+# the next. A step of 8,192 arenas thus took 542 us instead of 606 us on an H100
+# (docs/performance.md).
+_GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
+# XLA then does not choose kernels by timing them, and uses no kernel that adds in a varying order.
+_DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
 MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
-
-
-@dataclass(frozen=True, eq=False)
-class Program[C: ProgramConfig]:
-    """The parts that fix the compiled program.
-
-    Attributes:
-      config: its settings.
-      world: the compiled environment.
-      ppo: how the learners act and learn.
-      by_robot: whether to report each episode robot by robot.
-    """
-
-    config: C
-    world: World
-    ppo: PPO
-    by_robot: bool = False
-
-    @property
-    def shards(self) -> Shards:
-        """How the arenas are spread over devices."""
-        return shards_of(self.config)
-
-    @property
-    def rows(self) -> int:
-        """Most updates of one call."""
-        most = max(1, MAX_ROWS // self.config.seeds)
-        if self.by_robot:
-            most = min(most, episodes.rows_of_call(self.config))
-        return min(self.config.updates, most)
-
-    def curriculum(self, schedule: Schedule) -> Curriculum:
-        """Returns the curriculum with the numbers of a schedule."""
-        options = self.config.curriculum
-        own = {piece.name: piece for piece in extension.load(self.config.extensions).curricula}
-        if options.mode in own:
-            guard = explained(f"{extended.label(own[options.mode])} fails")
-            by_stage = Curriculum(*map(guard, guard(own[options.mode].function)(schedule)))
-        else:
-            by_stage = stage_modes.make(schedule, options)
-        if options.levels == "none":
-            return by_stage
-        return levels.make(by_stage, len(self.config.stage), options)
 
 
 def shards_of(config: ProgramConfig) -> Shards:
@@ -74,7 +36,17 @@ def shards_of(config: ProgramConfig) -> Shards:
 
 def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) -> Program[C]:
     """Builds the program of an environment that is there already; otherwise as `load`."""
-    return Program(config, world, load_ppo(config, world), by_robot)
+    rows = max(1, MAX_ROWS // config.seeds)
+    if by_robot:
+        rows = min(rows, episodes.rows_of_call(config))
+    return Program(
+        config,
+        world,
+        load_ppo(config, world),
+        by_robot=by_robot,
+        waiting=config.waiting,
+        rows=min(config.updates, rows),
+    )
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
@@ -132,14 +104,21 @@ def load_world(config: ProgramConfig) -> World:
 
 
 def schedule(config: ProgramConfig) -> Schedule:
-    """Computes the curriculum's numbers."""
-    return curricula.schedule(
-        config.stage,
-        config.curriculum,
-        updates=config.updates,
-        step_limit=config.task.step_limit,
-        rollout=config.algo.rollout_length,
-        drawings=extension.load(config.extensions).levels,
+    """Computes the curriculum's numbers.
+
+    The stages before the last share `budget_share` of the updates in equal parts.
+    """
+    options, before = config.curriculum, len(config.stage) - 1
+    share = options.budget_share * config.updates / max(before, 1)
+    deadline = [math.ceil(share * (i + 1)) for i in range(before)]
+    if options.mode not in ("sequential", "mixed"):
+        deadline = [NEVER] * before
+    return Schedule(
+        stages=task_stage.stack(config.stage, extension.load(config.extensions).levels),
+        deadline=np.array([*deadline, NEVER], np.int32),
+        threshold=np.float32(options.threshold),
+        floor=np.float32(options.floor),
+        cohort_updates=np.int32(math.ceil(config.task.step_limit / config.algo.rollout_length)),
     )
 
 
@@ -159,3 +138,17 @@ def side_by_side(config: ProgramConfig) -> int:
     """Returns how many seeds one call of the program steps at once on a device."""
     parts = config.devices if config.seeds_by == "devices" else groups(config, cores())
     return config.seeds // parts
+
+
+def compiler_options(*, deterministic: bool = False) -> dict[str, str | bool]:
+    """Returns XLA's options for loops like this one on JAX's current device.
+
+    Args:
+      deterministic: Whether a GPU must compute the same bits each time. A CPU always does.
+
+    Returns:
+      Values of XLA's options, by name.
+    """
+    if jax.default_backend() != "gpu":
+        return {}
+    return _GPU_OPTIONS | (_DETERMINISTIC if deterministic else {})

@@ -5,7 +5,7 @@ with N the robots of an arena that one learner drives.
 """
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -13,19 +13,52 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum.cohorts import UNCOUNTED
-from swarmjax.curriculum.engine import Next
+from swarmjax import extension
+from swarmjax.curriculum import stages as curricula
+from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, Next, Schedule
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
-from swarmjax.ppo.ppo import LearnerState
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.shards import ALONE, Shards
-from swarmjax.sim import drive, gaps, physics
+from swarmjax.sim import drive, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.env import EnvState, World
-from swarmjax.task.episode import Ended, Robots
+from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
-from swarmjax.training.program import Program
+from swarmjax.training import episodes
+from swarmjax.training.config import ProgramConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Program[C: ProgramConfig]:
+    """The parts that fix the compiled program; `program.py` builds them.
+
+    Attributes:
+      config: its settings.
+      world: the compiled environment.
+      ppo: how the learners act and learn.
+      by_robot: whether to report each episode robot by robot.
+      waiting: episodes that are drawn for each arena before a rollout.
+      rows: most updates of one call.
+    """
+
+    config: C
+    world: World
+    ppo: PPO
+    by_robot: bool = False
+    waiting: int = 1
+    rows: int = 1
+
+    @property
+    def shards(self) -> Shards:
+        """How the arenas are spread over devices."""
+        return self.ppo.learning.shards
+
+    def curriculum(self, schedule: Schedule) -> Curriculum:
+        """Returns the curriculum with the numbers of a schedule."""
+        own = extension.load(self.config.extensions).curricula
+        return curricula.make(schedule, self.config.curriculum, own)
 
 
 @struct.dataclass
@@ -86,7 +119,7 @@ def draw_starts(
 ) -> Arena:
     """Draws the levels of episodes that wait until their arena is free.
 
-    They are drawn before a rollout, `config.waiting` for each arena, and not at every step. An
+    They are drawn before a rollout, `program.waiting` for each arena, and not at every step. An
     arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
     otherwise short episodes would count more often than long ones.
 
@@ -154,9 +187,7 @@ def collect(
     return replace(arenas, sim=packed), trajectory, _to_ended(*counts)
 
 
-def batch(
-    program: Program, trajectory: Trajectory, memory: Recall, ended: Ended, learners: int
-) -> Batch:
+def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended) -> Batch:
     """Turns a rollout into the samples of an update.
 
     Args:
@@ -164,12 +195,11 @@ def batch(
       trajectory: [T, L, A, N, ...].
       memory: [A, R, H] memory of the arenas before the rollout.
       ended: [T, A] episodes that ended in it.
-      learners: L.
 
     Returns:
       [L] batches, each of A groups with T * N samples.
     """
-    first = jax.tree.map(lambda x: to_learners(x, learners), memory)
+    first = jax.tree.map(lambda x: to_learners(x, trajectory.valid.shape[1]), memory)
     each = jax.vmap(program.ppo.batch, in_axes=(1, 0, None))
     return each(trajectory, first, ended.episodes > 0)
 
@@ -201,20 +231,11 @@ class _Waiting(NamedTuple):
     judged: _Judged
 
 
-# The counts of `Ended`, by name, and how many numbers each has.
-_COUNTS = {
-    "episodes": 1,
-    "stage": 1,
-    "cohort": 1,
-    "targets": 1,
-    "reached": 1,
-    "all_reached": 1,
-    "steps": 1,
-    "robot_steps": 1,
-    "sensed": 1,
-    "contacts": len(gaps.KINDS),
-    "broken": 1,
-}
+# The counts of `Ended` that are one number each.
+_COUNTS = (
+    *("episodes", "stage", "cohort", "targets", "reached", "all_reached"),
+    *("steps", "robot_steps", "sensed", "broken"),
+)
 
 _Counts = tuple[Array, Ended]  # counts [A, K]; the other results [A]
 _Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
@@ -338,34 +359,18 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~came.sound).astype(jnp.int32),
         level=None if arenas.seed is None else mine(arenas.seed),
-        robots=jax.tree.map(mine, _robots(arenas)) if by_robot else None,
+        robots=jax.tree.map(mine, episodes.robots(arenas)) if by_robot else None,
     )
 
 
 def _to_counts(ended: Ended) -> _Counts:
     """Lays the counts [A, ...] of a step side by side [A, K], to write one array instead of 11."""
-    columns = [getattr(ended, name).reshape(len(ended.reward), -1) for name in _COUNTS]
-    rest = ended._replace(**dict.fromkeys(_COUNTS))
-    return jnp.concatenate(columns, axis=1), rest
+    columns = [getattr(ended, name)[:, None] for name in _COUNTS]
+    rest = ended._replace(contacts=None, **dict.fromkeys(_COUNTS))
+    return jnp.concatenate([*columns, ended.contacts], axis=1), rest
 
 
 def _to_ended(counts: Array, rest: Ended) -> Ended:
     """Undoes `_to_counts` for all steps of a rollout, [T, A, ...]."""
-    columns, first = {}, 0
-    for name, width in _COUNTS.items():
-        columns[name] = counts[..., first] if width == 1 else counts[..., first : first + width]
-        first += width
-    return rest._replace(**columns)
-
-
-def _robots(arenas: EnvState) -> Robots:
-    """Returns the outcome for each robot, [A, R]."""
-    present, episode = arenas.level.present, arenas.episode
-    return Robots(
-        present=present,
-        reached=present & arenas.arrived,
-        reward=episode.reward,
-        robot_steps=episode.moving,
-        sensed=episode.sensed,
-        contacts=jnp.sum(episode.contacts, axis=-1),
-    )
+    columns = {name: counts[..., i] for i, name in enumerate(_COUNTS)}
+    return rest._replace(contacts=counts[..., len(_COUNTS) :], **columns)

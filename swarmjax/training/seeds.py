@@ -17,7 +17,7 @@ from jax import Array
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.training import loop
 from swarmjax.training.loop import Metrics, TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 
 def chunk(program: Program) -> Callable[[Schedule, TrainState, Array], tuple[TrainState, Metrics]]:

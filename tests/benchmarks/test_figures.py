@@ -23,7 +23,7 @@ from swarmjax.task import env
 from swarmjax.task.env import EnvState, TimeStep, World
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 Line = dict[str, Any]
 

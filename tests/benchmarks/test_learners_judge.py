@@ -20,8 +20,7 @@ from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import evaluate
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.networks import Sizes
-from swarmjax.ppo.normalizer import Normalizer
+from swarmjax.ppo.networks import Normalizer, Sizes
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.task import env, level, observation

@@ -12,8 +12,7 @@ from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax.curriculum import cohorts, engine, stages
-from swarmjax.curriculum.cohorts import UNKNOWN
+from swarmjax.curriculum import engine, stages
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
@@ -21,6 +20,7 @@ from swarmjax.curriculum.engine import (
     NEVER,
     REWEIGHED,
     STAYED,
+    UNKNOWN,
     CurriculumState,
     Schedule,
 )
@@ -123,7 +123,7 @@ def _run(
     state, rows = _start(schedule, options), []
     for update, episodes in enumerate(seen, first):
         # An episode of no cohort stands for an update without episodes.
-        ended = _ended(state, episodes or [Episode(cohorts.UNCOUNTED - 10)])
+        ended = _ended(state, episodes or [Episode(engine.UNCOUNTED - 10)])
         before, state = state, observe(options, schedule, state, ended, update)
         judged = int(before.chosen.stage)
         success = state.cohorts.record.deciding(options.success)[judged]
@@ -272,7 +272,7 @@ def test_few_arenas_come_round_to_every_stage() -> None:
 
 
 def test_episodes_count_for_the_cohort_and_the_stage_in_which_they_began() -> None:
-    state = dataclasses.replace(cohorts.init(3), number=jnp.int32(5))
+    state = dataclasses.replace(engine.init_cohorts(3), number=jnp.int32(5))
     ended = Ended(
         episodes=jnp.array([[1, 1, 1], [1, 0, 1]]),
         stage=jnp.array([[0, 2, 2], [2, 0, 1]]),
@@ -287,7 +287,7 @@ def test_episodes_count_for_the_cohort_and_the_stage_in_which_they_began() -> No
         reward=jnp.array([[0.5, 1.5, 9.0], [-2.0, 0.0, 9.0]]),
         broken=jnp.zeros((2, 3), jnp.int32),
     )
-    state = cohorts.count(cohorts.count(state, ended), ended)  # counted twice
+    state = engine.count(engine.count(state, ended), ended)  # counted twice
     current = [column.tolist() for column in state.current]
     # The first arena has 0 + 1 + 2 contacts in the first step, and 9 + 10 + 11 in the second.
     assert current == [[2, 0, 2], [4, 0, 8], [2, 0, 4], [0, 0, 0], [6, 0, 60], [1.0, 0.0, -4.0]]

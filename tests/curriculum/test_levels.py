@@ -11,8 +11,8 @@ import pytest
 from hypothesis import strategies as st
 
 from swarmjax.curriculum import levels
-from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.config import CurriculumConfig
+from swarmjax.curriculum.engine import UNCOUNTED
 from swarmjax.curriculum.levels import LevelBuffer, Plays
 from swarmjax.task.episode import Ended
 

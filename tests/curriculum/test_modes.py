@@ -14,8 +14,7 @@ from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax.curriculum import cohorts, engine, stages
-from swarmjax.curriculum.cohorts import CohortVerdict
+from swarmjax.curriculum import engine, stages
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
@@ -24,6 +23,7 @@ from swarmjax.curriculum.engine import (
     REASONS,
     REWEIGHED,
     STAYED,
+    CohortVerdict,
     CurriculumState,
     Next,
     Schedule,
@@ -74,7 +74,7 @@ def _verdict(
     fast: list[float] | None = None,
 ) -> CohortVerdict:
     values = jnp.array(success, jnp.float32)
-    record = cohorts.init(len(success)).record
+    record = engine.init_cohorts(len(success)).record
     if fast is not None:
         record = record._replace(fast=jnp.array(fast, jnp.float32))
     return CohortVerdict(

@@ -18,9 +18,9 @@ from swarmjax import outputs, policy
 from swarmjax.export import c as export_c
 from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
-from swarmjax.ppo import networks, normalizer
+from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.networks import Hearing, Sizes
+from swarmjax.ppo.networks import Hearing, Normalizer, Sizes
 from swarmjax.task.config import NEIGHBOUR_SIZE, NeighboursConfig
 
 OBSERVATIONS = 10_000
@@ -42,13 +42,13 @@ def _by_flax(arrays: Arrays, activation: Activation, seen: np.ndarray) -> np.nda
 
         torso = {f"hidden_{i}": layer(f"hidden_{i}") for i in range(len(config.hidden_sizes))}
         actor = {"torso": torso, "mean": layer("mean"), "log_std": mine["actor/log_std"]}
-        moments = normalizer.Normalizer(
+        moments = Normalizer(
             count=jnp.ones(()),
             mean=mine["normalizer/mean"],
             variance=mine["normalizer/std"] ** 2,
             rest=jnp.zeros((2, 1)),
         )
-        features = normalizer.normalize(moments, observation)
+        features = moments.normalize(observation)
         return ppo_parts.nets(config, *SIZES).act({"actor": actor}, features, ()).mean
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
@@ -119,13 +119,13 @@ def _by_flax_steps(arrays: Arrays, seen: np.ndarray, begins: np.ndarray) -> np.n
         memory = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
         heads = {"mean": layer("mean"), "log_std": mine["actor/log_std"]}
         actor = {"torso": torso, "memory": memory, **heads}
-        moments = normalizer.Normalizer(
+        moments = Normalizer(
             count=jnp.ones(()),
             mean=mine["normalizer/mean"],
             variance=mine["normalizer/std"] ** 2,
             rest=jnp.zeros((2, 1)),
         )
-        features = normalizer.normalize(moments, observation)
+        features = moments.normalize(observation)
         none = jnp.zeros(MEMORY)
         nets = ppo_parts.nets(config, *SIZES)
         return nets.act({"actor": actor}, features, none, begins).mean
@@ -221,10 +221,8 @@ def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.nda
             actor["memory"] = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
             none, began = jnp.zeros(MEMORY), begins
         mean, std = (mine[f"normalizer/{name}"] for name in ("mean", "std"))
-        moments = normalizer.Normalizer(
-            count=jnp.ones(()), mean=mean, variance=std**2, rest=jnp.zeros((2, 1))
-        )
-        features = normalizer.normalize(moments, observation)
+        moments = Normalizer(count=jnp.ones(()), mean=mean, variance=std**2, rest=jnp.zeros((2, 1)))
+        features = moments.normalize(observation)
         return nets.act({"actor": actor}, features, none, began).mean
 
     mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))

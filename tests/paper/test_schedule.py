@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from swarmjax.curriculum.engine import Next, Schedule
-from swarmjax.ppo import ppo
+from swarmjax.ppo import exploration
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import SimConfig
@@ -21,7 +21,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 PAPER = load_train(["algo=paper", "sim.impl=jax"])
 
@@ -59,7 +59,7 @@ def _replay(config: TrainConfig, steps: int, arrived: np.ndarray) -> Replay:
 def test_the_deviation_of_every_one_of_a_million_steps() -> None:
     steps = 1_000_000
     replay = _replay(PAPER, steps, np.zeros(steps, bool))
-    found = ppo.scheduled_std(PAPER.algo, jnp.arange(steps))
+    found = exploration.scheduled_std(PAPER.algo, jnp.arange(steps))
     np.testing.assert_array_equal(found, replay.std.astype(np.float32))
     counts = np.unique(replay.std, return_counts=True)
     assert [each.tolist() for each in counts] == [[0.45, 0.5, 0.55, 0.6], [250_000] * 4]
@@ -72,7 +72,7 @@ def test_the_updates_of_a_million_steps() -> None:
     assert made == [step for step, _ in replay.updates]
     # An update learns with the deviation of its rollout's last step. If the deviation drops at the
     # same step, as at 750,000, the update comes before the drop.
-    last = ppo.scheduled_std(PAPER.algo, jnp.array(made) - 1)
+    last = exploration.scheduled_std(PAPER.algo, jnp.array(made) - 1)
     np.testing.assert_array_equal(last, np.float32([std for _, std in replay.updates]))
     assert (750_000, 0.5) in replay.updates
 

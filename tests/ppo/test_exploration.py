@@ -8,7 +8,7 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import ppo
+from swarmjax.ppo import exploration
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -25,18 +25,18 @@ SCHEDULED = AlgoConfig(
 
 def test_levels_by_hand() -> None:
     expected = (0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15, 0.1)
-    assert ppo.scheduled_stds(SCHEDULED) == expected  # exact, since rounded to four digits
+    assert exploration.scheduled_stds(SCHEDULED) == expected  # exact, since rounded to four digits
     # The second level is 0.5 - 0.3 = 0.2, and the third is the floor, 0.15, instead of -0.1.
     steep = replace(SCHEDULED, initial_std=0.5, std_decrement=0.3, std_floor=0.15)
-    assert ppo.scheduled_stds(steep) == (0.5, 0.2, 0.15)
-    assert ppo.scheduled_stds(replace(SCHEDULED, initial_std=0.1)) == (0.1,)
+    assert exploration.scheduled_stds(steep) == (0.5, 0.2, 0.15)
+    assert exploration.scheduled_stds(replace(SCHEDULED, initial_std=0.1)) == (0.1,)
     # A decrement that rounds to 0 never lowers the deviation.
-    assert ppo.scheduled_stds(replace(SCHEDULED, std_decrement=1e-5)) == (0.6,)
+    assert exploration.scheduled_stds(replace(SCHEDULED, std_decrement=1e-5)) == (0.6,)
 
 
 def test_each_level_holds_for_an_interval_and_the_last_for_ever() -> None:
     steps = jnp.array([0, 99, 100, 199, 200, 999, 1000, 2**31 - 1])
-    found = ppo.scheduled_std(SCHEDULED, steps)
+    found = exploration.scheduled_std(SCHEDULED, steps)
     expected = np.array([0.6, 0.6, 0.55, 0.55, 0.5, 0.15, 0.1, 0.1], np.float32)
     np.testing.assert_array_equal(found, expected)
 

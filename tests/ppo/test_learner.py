@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from swarmjax.ppo import losses, networks, optimizer, ppo
+from swarmjax.ppo import gradients, networks, optimizer
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
@@ -28,7 +28,7 @@ def _ppo(config: AlgoConfig = CONFIG) -> PPO:
 @functools.partial(jax.jit, static_argnames="config")
 def _update(
     state: LearnerState, batch: Batch, key: jax.Array, config: AlgoConfig = CONFIG
-) -> tuple[LearnerState, losses.Metrics]:
+) -> tuple[LearnerState, gradients.Metrics]:
     return _ppo(config).update(state, batch, key)
 
 
@@ -115,7 +115,7 @@ def test_act_mode_and_values_normalise_raw_observations() -> None:
 
 def test_observations_are_cut_at_ten_deviations() -> None:
     far = jnp.array([1e4, -1e4, 10.5])
-    np.testing.assert_array_equal(ppo.normalize(_fresh(), far), [10.0, -10.0, 10.0])
+    np.testing.assert_array_equal(_fresh().normalizer.normalize(far), [10.0, -10.0, 10.0])
 
 
 def test_the_first_minibatch_starts_at_ratio_one_with_the_old_normalizer() -> None:
@@ -167,15 +167,15 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
     valid = np.asarray(batch.valid)
     advantage = np.asarray(batch.advantage)
     inside = advantage[valid]
-    minibatch = losses.Minibatch(
-        observation=ppo.normalize(state, batch.observation)[valid],
+    minibatch = gradients.Minibatch(
+        observation=state.normalizer.normalize(batch.observation)[valid],
         action=batch.action[valid],
         log_prob=batch.log_prob[valid],
         advantage=jnp.asarray((inside - inside.mean()) / inside.std()),
         return_=batch.return_[valid],
         valid=jnp.ones(valid.sum(), bool),
     )
-    (_, expected), gradient = jax.value_and_grad(losses.ppo_loss, has_aux=True)(
+    (_, expected), gradient = jax.value_and_grad(gradients.ppo_loss, has_aux=True)(
         state.params,
         minibatch,
         _ppo(ONE_STEP).learning.networks,
@@ -389,7 +389,7 @@ def test_observations_may_be_left_as_they_are() -> None:
     updated, _ = _update(state, _batch(state, 0, config), jax.random.key(1), config=config)
     _assert_equal(updated.normalizer, state.normalizer)
     seen = jnp.array([4.0, -3.25, 0.5])
-    np.testing.assert_array_equal(ppo.normalize(updated, seen), seen)
+    np.testing.assert_array_equal(updated.normalizer.normalize(seen), seen)
 
 
 def test_advantages_of_monte_carlo_returns_are_taken_as_they_are() -> None:

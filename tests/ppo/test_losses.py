@@ -10,9 +10,9 @@ import pytest
 import scipy.stats
 from flax import traverse_util
 
-from swarmjax.ppo import losses
+from swarmjax.ppo import gradients
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.losses import Minibatch, ppo_loss
+from swarmjax.ppo.gradients import Minibatch, ppo_loss
 
 B, OBSERVATION, U = 24, 3, 2
 CONFIG = AlgoConfig(
@@ -28,7 +28,7 @@ def _minibatch(valid_share: float = 0.6) -> Minibatch:
     observation = random.normal(size=(B, OBSERVATION)).astype(np.float32)
     action = random.normal(size=(B, U)).astype(np.float32)
     mean, std, *_ = NETS.act(PARAMS, observation, ())
-    log_prob = np.asarray(losses.log_density(mean, std, action))
+    log_prob = np.asarray(gradients.log_density(mean, std, action))
     return Minibatch(
         observation=observation,
         action=action,
@@ -80,7 +80,7 @@ def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
 def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     minibatch = _minibatch()
     mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
-    log_prob = losses.log_density(mean, std, minibatch.action)
+    log_prob = gradients.log_density(mean, std, minibatch.action)
     config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0, bound_cost=0.0)
 
     def slope(ratio: float, advantage: float) -> float:
@@ -171,7 +171,7 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error(
     minibatch = replace(_minibatch(), state=state)
     count = jnp.float32(14.0)
     loss, metrics = ppo_loss(params, minibatch, nets, config, count)
-    monkeypatch.setattr(losses, "GUESS_COST", 0.0)
+    monkeypatch.setattr(gradients, "GUESS_COST", 0.0)
     free, _ = ppo_loss(params, minibatch, nets, config, count)
     flat = traverse_util.flatten_dict(params["actor"], sep="/")
     layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}

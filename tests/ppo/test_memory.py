@@ -12,10 +12,10 @@ from flax import linen as nn
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.config import ConfigError
-from swarmjax.ppo import losses
+from swarmjax.ppo import gradients
 from swarmjax.ppo.batch import Batch, generalized_advantages
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.losses import Minibatch
+from swarmjax.ppo.gradients import Minibatch
 from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO
@@ -123,7 +123,7 @@ def test_the_gradient_through_time_is_that_of_finite_differences() -> None:
         towards = np.random.default_rng(0).normal(size=(4, len(flat)))
 
         def loss(flat: jax.Array) -> jax.Array:
-            return losses.ppo_loss(tree(flat), minibatch, nets, CONFIG, jnp.float64(20.0))[0]
+            return gradients.ppo_loss(tree(flat), minibatch, nets, CONFIG, jnp.float64(20.0))[0]
 
         gradient, step = jax.grad(loss)(flat), 1e-6
         for way in towards:

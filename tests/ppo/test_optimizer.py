@@ -6,9 +6,9 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import optimizer
+from swarmjax.ppo import gradients, optimizer
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.optimizer import Learning
+from swarmjax.ppo.gradients import Learning
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_means_are_those_of_the_steps_that_were_taken() -> None:
         "taken_steps": jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]),
         "skipped_steps": jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]),
     }
-    found = optimizer.mean_of_taken(metrics)
+    found = gradients.mean_of_taken(metrics)
     assert found["loss"] == pytest.approx((1.0 + 2.0 + 6.0) / 3)
     assert found["skipped_steps"] == 1.0
 
@@ -58,9 +58,9 @@ def test_an_update_that_took_no_step_has_no_means_if_one_was_skipped() -> None:
         "taken_steps": jnp.zeros(3),
         "skipped_steps": jnp.array([1.0, 0.0, 1.0]),
     }
-    assert optimizer.mean_of_taken(metrics)["loss"] == -np.inf
+    assert gradients.mean_of_taken(metrics)["loss"] == -np.inf
     nothing = metrics | {"skipped_steps": jnp.zeros(3)}
-    assert optimizer.mean_of_taken(nothing)["loss"] == 0.0
+    assert gradients.mean_of_taken(nothing)["loss"] == 0.0
 
 
 def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> None:
@@ -71,7 +71,7 @@ def test_one_broken_gradient_leaves_parameters_and_optimiser_as_they_are() -> No
     progress = (params, adam.init(params))
     gradient = {"actor": {"w": jnp.array([1.0, jnp.nan, 0.0])}, "critic": {"w": jnp.ones(2)}}
     loss = {"policy_loss": jnp.float32(jnp.nan)}
-    found, metrics = optimizer.take(learning, progress, (gradient, loss), jnp.array(True))
+    found, metrics = gradients.take(learning, progress, (gradient, loss), jnp.array(True))
     jax.tree.map(np.testing.assert_array_equal, found, progress)
     assert metrics["skipped_steps"] == 1.0
     assert metrics["policy_loss"] == 0.0

@@ -10,12 +10,12 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import losses, ppo
+from swarmjax.ppo import gradients, ppo
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import sequences
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Metrics, Minibatch
 from swarmjax.ppo.memory import Recall
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
@@ -96,7 +96,7 @@ def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int
     ]
     found = jax.tree.map(lambda *x: sum(x), *parts)
     whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
-    expected = jax.grad(losses.ppo_loss, has_aux=True)(
+    expected = jax.grad(gradients.ppo_loss, has_aux=True)(
         params, whole, _ppo(CONFIG).learning.networks, CONFIG, count
     )
     # Sums of 80 float32 terms of order 1 to 100, added in another order.

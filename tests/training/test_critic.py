@@ -15,10 +15,10 @@ from flax import linen as nn
 from swarmjax import policy, policy_file
 from swarmjax.config import ConfigError
 from swarmjax.extension import Network
-from swarmjax.ppo import dispatch, losses, networks, ppo
+from swarmjax.ppo import dispatch, gradients, networks
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.networks import Sizes
+from swarmjax.ppo.networks import Normalizer, Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.checkpoint import to_leaves
 from swarmjax.run.policy_export import write_policy
@@ -28,8 +28,7 @@ from swarmjax.task import env, observation
 from swarmjax.task.env import EnvState
 from swarmjax.training import loop, mesh, rollout, seeds
 from swarmjax.training import program as programs
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 
 class Trained(NamedTuple):
@@ -79,7 +78,7 @@ def _value(trained: Trained, arenas: Arena, memory: jax.Array) -> np.ndarray:
         rollout.to_learners(x, trained.program.config.learners)
         for x in (arenas.observation, memory)
     )
-    normal = jax.vmap(ppo.normalize)(trained.learners, seen)
+    normal = jax.vmap(Normalizer.normalize)(trained.learners.normalizer, seen)
     nets = trained.program.ppo.learning.networks
     value, _ = jax.vmap(nets.value)(trained.learners.params, normal, _look(trained, arenas), mine)
     return np.asarray(value)
@@ -224,7 +223,7 @@ def test_a_value_that_only_the_state_tells_is_learned() -> None:
 def test_a_state_changes_nothing_of_the_policy_but_by_its_guess(
     backend: dispatch.Backend, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(losses, "GUESS_COST", 0.0)
+    monkeypatch.setattr(gradients, "GUESS_COST", 0.0)
     # No clipping here: it scales both networks by one norm, so the critic would change the actor.
     config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
     made = _ppo(config, backend)

@@ -20,7 +20,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import Metrics, TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 Update = Callable[[TrainState], tuple[TrainState, Metrics]]
 

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from swarmjax.curriculum import levels as level_replay
-from swarmjax.curriculum.cohorts import UNCOUNTED
 from swarmjax.curriculum.config import CurriculumConfig
-from swarmjax.curriculum.engine import Schedule
+from swarmjax.curriculum.engine import UNCOUNTED, Schedule
 from swarmjax.curriculum.levels import LevelBuffer
 from swarmjax.ppo.batch import value_loss
 from swarmjax.run.checkpoint import digest, from_leaves, to_leaves
@@ -24,7 +23,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 UPDATES = 20
 pytestmark = pytest.mark.slow  # a run of the whole program; tests/curriculum has the rules
@@ -152,7 +151,7 @@ def test_value_loss_of_a_rollout(trained: Trained) -> None:
     collect = jax.jit(partial(rollout.collect, program))
     _, trajectory, ended = collect(state.learners, arenas, waiting, jax.random.key(6))
     over = np.asarray(ended.episodes) > 0
-    batch = rollout.batch(program, trajectory, arenas.recall, ended, 1)
+    batch = rollout.batch(program, trajectory, arenas.recall, ended)
     loss = np.asarray(jax.jit(value_loss)(batch, over))
     steps, robots = over.shape[0], np.asarray(trajectory.valid).shape[-1]
     advantage = np.asarray(batch.advantage).reshape(8, steps, robots)

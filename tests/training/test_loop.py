@@ -20,7 +20,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 Chunk = Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
 
@@ -292,10 +292,10 @@ def test_newcomers_start_from_what_the_others_learned(independent: Independent) 
 
 
 def test_xla_has_options_on_a_gpu_alone_and_knows_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert loop.compiler_options() == {}
+    assert programs.compiler_options() == {}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    options = loop.compiler_options(deterministic=True)
-    assert options.keys() > loop.compiler_options().keys() > set()
+    options = programs.compiler_options(deterministic=True)
+    assert options.keys() > programs.compiler_options().keys() > set()
     lowered = jax.jit(lambda x: x + 1.0).lower(1.0)
     assert lowered.compile(options)(1.0) == 2.0
     with pytest.raises(Exception, match="No such compile option"):

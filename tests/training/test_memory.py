@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from swarmjax.curriculum.engine import Schedule
-from swarmjax.ppo import losses, ppo
+from swarmjax.ppo import gradients, ppo
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.ppo import LearnerState
@@ -20,8 +20,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 SIZE, UPDATES = 4, 6
 
@@ -56,7 +55,7 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     arenas, trajectory, ended = collect(last.learners, before, waiting, jax.random.key(2))
-    batch = rollout.batch(program, trajectory, before.recall, ended, config.learners)
+    batch = rollout.batch(program, trajectory, before.recall, ended)
     over = np.asarray(ended.episodes) > 0
     return Trained(program, schedule, last, arenas, trajectory, over, batch)
 
@@ -73,8 +72,8 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
     nets = trained.program.ppo.learning.networks
-    (mean, std, *_), value = losses.evaluate(_one(learners).params, nets, minibatch)
-    log_prob = losses.log_density(mean, std, minibatch.action)
+    (mean, std, *_), value = gradients.evaluate(_one(learners).params, nets, minibatch)
+    log_prob = gradients.log_density(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50
     assert trained.over.any()  # episodes end within the rollout

@@ -19,7 +19,7 @@ from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training import loop
 from swarmjax.training import program as programs
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 LEARNERS, OBSERVED = 5, 3
 ALGO = AlgoConfig(

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from entries import DISTANCE, INFRARED
 
-from swarmjax.curriculum.cohorts import UNCOUNTED
-from swarmjax.curriculum.engine import Next
+from swarmjax.curriculum.engine import UNCOUNTED, Next
 from swarmjax.ppo import batch
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
@@ -27,8 +26,7 @@ from swarmjax.task.episode import Ended
 from swarmjax.task.level import Level
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
-from swarmjax.training.program import Program
-from swarmjax.training.rollout import Arena
+from swarmjax.training.rollout import Arena, Program
 
 ArenaStep = Callable[[Arena, jax.Array], tuple[Arena, TimeStep]]
 Draw = Callable[[int, int], Arena]

@@ -19,7 +19,7 @@ from swarmjax.task.env import World
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
-from swarmjax.training.program import Program
+from swarmjax.training.rollout import Program
 
 SEEDS, UPDATES = 3, np.int32(2)
 Run = Callable[[TrainState, np.int32], tuple[TrainState, dict]]

@@ -13,10 +13,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from swarmjax.ppo import losses, optimizer
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo import gradients
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import Learning, Progress
 
 # Samples of a block. With layers of 64, sizes from 100 to 6,000 were tried: 250 to 400 samples took
 # the least CPU time.
@@ -55,7 +54,7 @@ def learn(
 
         def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
             found = gradient(progress[0], blocks, learning, count)
-            return optimizer.take(learning, progress, found, count > 0)
+            return gradients.take(learning, progress, found, count > 0)
 
         return jax.lax.scan(epoch, begun, length=learning.config.epochs)
 
@@ -86,7 +85,7 @@ def arrange(samples: Minibatch) -> Blocks:
 def gradient(
     params: Params, blocks: Blocks, learning: Learning, expected_valid: jax.Array
 ) -> tuple[Params, Metrics]:
-    """Computes the gradient of `losses.ppo_loss` over all samples.
+    """Computes the gradient of `gradients.ppo_loss` over all samples.
 
     Args:
       params: Parameters of the actor and the critic.
@@ -100,7 +99,7 @@ def gradient(
 
     def of_block(i: jax.Array | int) -> tuple[Params, Metrics]:
         block = jax.tree.map(lambda x: x[i], blocks.samples)
-        return jax.grad(losses.ppo_loss, has_aux=True)(
+        return jax.grad(gradients.ppo_loss, has_aux=True)(
             params, block, learning.networks, learning.config, expected_valid
         )
 

@@ -1,6 +1,6 @@
 """The gradient of the PPO loss of a minibatch on an NVIDIA GPU, with one kernel for each network.
 
-It is the gradient of `losses.ppo_loss`, written out. With s over the valid samples, n =
+It is the gradient of `gradients.ppo_loss`, written out. With s over the valid samples, n =
 max(expected_valid, 1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the critic, that loss
 is
 
@@ -26,14 +26,13 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from swarmjax.ppo import losses, optimizer
+from swarmjax.ppo import gradients
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
 from swarmjax.ppo.fast.blocks import valid_first
 from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import Learning, Progress
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
 # each of the 128 threads then uses all of its 255 registers, and a program uses 80 kB of the chip's
@@ -44,7 +43,7 @@ LARGE = Launch(tile=128, programs=264, warps=8)
 # Fewest tiles of a minibatch: with fewer, one tile more or less makes minibatches too unequal.
 _LEAST_TILES = 8
 
-# The metrics of a step with kernels: those of `losses.ppo_loss` for a critic of the observation,
+# The metrics of a step with kernels: those of `gradients.ppo_loss` for a critic of the observation,
 # the norm of the gradient before clipping, and two flags. One flag is 1 if the step was taken, the
 # other if it was skipped.
 METRICS = (
@@ -193,7 +192,7 @@ def flat_gradient(
       samples: B samples. `valid` is float32, 0 or 1, so that no step has to convert it.
       tiles: The minibatch, in tiles of `launch.tile` samples.
       config: Clip range and costs.
-      expected_valid: [], as `losses.ppo_loss` takes it.
+      expected_valid: [], as `gradients.ppo_loss` takes it.
       launch: How the kernels are spread over the GPU.
       interpret: Whether to run them as ordinary JAX, on any device.
 
@@ -220,7 +219,7 @@ def flat_gradient(
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
-    metrics["entropy"] = losses.entropy(deviation) * weight
+    metrics["entropy"] = gradients.entropy(deviation) * weight
     found = {
         "actor": _with_entropy(actor * share, config, weight, first, width),
         "critic": critic * (config.value_cost * share),
@@ -317,7 +316,7 @@ def _surrogate(
         * advantage
     )
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
-    beyond = jnp.where(valid[:, None], losses.beyond_range(mean), 0.0)
+    beyond = jnp.where(valid[:, None], gradients.beyond_range(mean), 0.0)
     slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
     if config.mean_activation == "tanh":
         slope *= 1.0 - mean * mean
@@ -384,7 +383,7 @@ def learn(
         gradient, metrics, taken = flat_gradient(
             progress[0], layout, arranged, tiles, config, expected_valid, launch=launch
         )
-        progress, metrics = optimizer.take(learning, progress, (gradient, metrics), taken > 0)
+        progress, metrics = gradients.take(learning, progress, (gradient, metrics), taken > 0)
         return progress, jnp.stack([metrics[name] for name in METRICS])
 
     (flat, flat_state), rows = jax.lax.scan(step, (flatten(params), flat_state), dealt.span)

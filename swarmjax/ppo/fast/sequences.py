@@ -13,12 +13,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from swarmjax.ppo import losses, optimizer
+from swarmjax.ppo import gradients
 from swarmjax.ppo.fast import blocks
-from swarmjax.ppo.losses import Metrics, Minibatch
+from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
 from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.ppo.networks import Params
-from swarmjax.ppo.optimizer import Learning, Progress
 from swarmjax.shards import ALONE, Shards
 
 # Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
@@ -71,7 +70,7 @@ def learn(
 
         def step(progress: Progress, span: jax.Array) -> tuple[Progress, Metrics]:
             found = gradient(progress[0], rows, dealt.order, span, learning, expected_valid)
-            return optimizer.take(learning, progress, found, span[1] > span[0])
+            return gradients.take(learning, progress, found, span[1] > span[0])
 
         return jax.lax.scan(step, progress, dealt.span)
 
@@ -137,7 +136,7 @@ def gradient(
     learning: Learning,
     expected_valid: jax.Array,
 ) -> tuple[Params, Metrics]:
-    """Computes the gradient of `losses.ppo_loss` over the sequences of one minibatch.
+    """Computes the gradient of `gradients.ppo_loss` over the sequences of one minibatch.
 
     Args:
       params: Parameters of the actor and the critic.
@@ -156,7 +155,7 @@ def gradient(
 
     def of_tile(i: jax.Array | int) -> tuple[Params, Metrics]:
         tile = take_tile(rows, order, span[0] + i * size, span[1], size)
-        return jax.grad(losses.ppo_loss, has_aux=True)(
+        return jax.grad(gradients.ppo_loss, has_aux=True)(
             params, tile, learning.networks, config, expected_valid
         )
 

@@ -9,11 +9,11 @@ import learners
 import numpy as np
 import pytest
 
-from swarmjax.ppo import losses, networks
+from swarmjax.ppo import gradients, networks
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import blocks
-from swarmjax.ppo.losses import Minibatch
+from swarmjax.ppo.gradients import Minibatch
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 
@@ -54,7 +54,7 @@ def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) ->
     count = jnp.sum(samples.valid)
     found = blocks.gradient(params, arranged, PPO_.learning, count)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-    whole = jax.grad(losses.ppo_loss, has_aux=True)
+    whole = jax.grad(gradients.ppo_loss, has_aux=True)
     # float32 rounding: the two gradients add the samples in different orders.
     for mine, theirs in zip(
         jax.tree.leaves(found),

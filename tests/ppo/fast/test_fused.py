@@ -15,13 +15,13 @@ import pytest
 from hypothesis import strategies as st
 from jax.sharding import AbstractDevice, AbstractMesh
 
-from swarmjax.ppo import losses, optimizer
+from swarmjax.ppo import gradients
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
 from swarmjax.ppo.fast import fused, kernel
 from swarmjax.ppo.fast.kernel import Launch
-from swarmjax.ppo.losses import Minibatch
+from swarmjax.ppo.gradients import Minibatch
 from swarmjax.ppo.networks import Networks, Params, Sizes
 from swarmjax.ppo.ppo import PPO, LearnerState
 
@@ -58,7 +58,7 @@ def _log_prob(
     params: Params, config: AlgoConfig, observation: jax.Array, action: jax.Array
 ) -> jax.Array:
     acted = _nets(config).act(params, observation, ())
-    return losses.log_density(acted.mean, acted.std, action)
+    return gradients.log_density(acted.mean, acted.std, action)
 
 
 def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> Minibatch:
@@ -80,7 +80,7 @@ def _minibatch(params: Params, config: AlgoConfig, size: int, seed: int = 0) -> 
 def _expected(params: Params, minibatch: Minibatch, config: AlgoConfig, count: float) -> Any:
     """Returns the gradient and the metrics of autodiff."""
     with jax.default_matmul_precision("highest"):
-        gradient = jax.grad(losses.ppo_loss, has_aux=True)
+        gradient = jax.grad(gradients.ppo_loss, has_aux=True)
         valid = jnp.float32(count)
         return jax.jit(gradient, static_argnums=(2, 3))(
             params, minibatch, _nets(config), config, valid
@@ -104,7 +104,7 @@ def _gradient(
     launch: Launch | None = None,
     interpret: bool = False,
 ) -> Any:
-    """Computes with the kernels what `jax.grad(losses.ppo_loss, has_aux=True)` does."""
+    """Computes with the kernels what `jax.grad(gradients.ppo_loss, has_aux=True)` does."""
     sizes = minibatch.observation.shape[1], minibatch.action.shape[1]
     launch = fused.choose_launch(config, *sizes) if launch is None else launch
     tiles = -(-len(minibatch.valid) // launch.tile)
@@ -321,10 +321,10 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
         chosen = np.asarray(tiles.order)[first:last]
         rows = np.concatenate([np.arange(64 * i, min(64 * i + 64, count)) for i in chosen])
         part = jax.tree.map(lambda x, rows=rows: x[rows], valid)
-        gradient = jax.grad(losses.ppo_loss, has_aux=True)
+        gradient = jax.grad(gradients.ppo_loss, has_aux=True)
         slope = gradient(progress[0], part, _nets(config), config, count / 4)
         learning = _ppo(config).learning
-        progress, metrics = optimizer.take(learning, progress, slope, jnp.bool_(True))
+        progress, metrics = gradients.take(learning, progress, slope, jnp.bool_(True))
         told.append(metrics)
     means = jax.tree.map(lambda *x: np.mean(x), *told)
     del means["taken_steps"]
@@ -396,7 +396,7 @@ def test_what_the_kernels_tell_are_the_metrics_of_the_loss() -> None:
         "grad_norm",
         "taken_steps",
         "skipped_steps",
-    )  # metrics that `optimizer.take` adds to the metrics of the loss
+    )  # metrics that `gradients.take` adds to the metrics of the loss
     assert sorted(expected) == [name for name in fused.METRICS if name not in of_the_step]
 
 

@@ -1,21 +1,25 @@
-"""The PPO loss of one minibatch of B samples, some of which may be invalid.
+"""One gradient step: the PPO loss of a minibatch, and the optimiser's step along its gradient.
 
-Actions are drawn from a diagonal Gaussian; U is the size of an action.
+A minibatch has B samples, some of which may be invalid. Actions are drawn from a diagonal Gaussian;
+U is the size of an action.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.networks import Acted, Networks, Params
+from swarmjax.shards import ALONE, Shards
 
 Metrics = dict[str, jax.Array]
+Progress = tuple[Params, optax.OptState]
 
 # Weight of the guess of the state that the critic sees. Whole runs with 0.02 solved more than runs
 # with 0 (docs/worlds-notes.md, "The guess of the state").
@@ -48,6 +52,24 @@ class Minibatch:
     memory: Recall = NO_MEMORY
     begins: Any = ()
     state: Any = ()
+
+
+class Learning(NamedTuple):
+    """What every way of computing an update uses.
+
+    Attributes:
+      config: settings of PPO.
+      networks: actor and critic.
+      optimizer: the optimiser that `optimizer.make` made.
+      shards: how the samples are spread over devices.
+      side_by_side: how many learners a device trains at once.
+    """
+
+    config: AlgoConfig
+    networks: Networks
+    optimizer: optax.GradientTransformation
+    shards: Shards = ALONE
+    side_by_side: int = 1
 
 
 def ppo_loss(
@@ -98,7 +120,15 @@ def ppo_loss(
         [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
     )
     metrics = _terms(*evaluate(params, networks, minibatch), minibatch, config, expected_valid)
-    return _total(metrics, config), metrics
+    total = (
+        metrics["policy_loss"]
+        + config.value_cost * metrics["value_loss"]
+        - config.entropy_cost * metrics["entropy"]
+        + config.bound_cost * metrics["bound_loss"]
+    )
+    if "guess_loss" in metrics:
+        total = total + GUESS_COST * metrics["guess_loss"]
+    return total, metrics
 
 
 def _terms(
@@ -131,19 +161,6 @@ def _terms(
         error = acted.guess - minibatch.state
         metrics["guess_loss"] = mean(jnp.sum(error**2, axis=-1))
     return metrics
-
-
-def _total(metrics: Metrics, config: AlgoConfig) -> jax.Array:
-    """Returns the sum [] of the loss's terms, weighted by their costs."""
-    total = (
-        metrics["policy_loss"]
-        + config.value_cost * metrics["value_loss"]
-        - config.entropy_cost * metrics["entropy"]
-        + config.bound_cost * metrics["bound_loss"]
-    )
-    if "guess_loss" not in metrics:
-        return total
-    return total + GUESS_COST * metrics["guess_loss"]
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
@@ -215,3 +232,65 @@ def entropy(std: jax.Array) -> jax.Array:
     """
     chex.assert_rank(std, 1)
     return jnp.sum(jnp.log(std) + 0.5 * math.log(2.0 * math.pi * math.e))
+
+
+def take(
+    learning: Learning, progress: Progress, found: tuple[Params, Metrics], any_valid: jax.Array
+) -> tuple[Progress, Metrics]:
+    """Takes a step along a gradient, unless no sample is valid.
+
+    Devices add up their gradients and metrics, and take the same step.
+
+    A step is skipped, and counted, if its gradient or its result is not finite.
+    `optax.apply_if_finite` is not enough: it checks the gradient alone, so a broken optimiser state
+    would break the parameters. After some skipped steps it also takes a step that is not finite.
+
+    Args:
+      learning: The optimiser, and how the samples are spread over devices.
+      progress: Parameters and the optimiser's state before.
+      found: The gradient, and the metrics of its loss.
+      any_valid: [], whether the gradient includes a valid sample.
+
+    Returns:
+      Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
+      and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
+    """
+    params, optimizer_state = progress
+    # One sum for all: on several devices each sum takes tens of microseconds, whatever its size.
+    (gradient, metrics), devices = learning.shards.sum((found, any_valid.astype(jnp.float32)))
+    any_valid = devices > 0.0
+    metrics["grad_norm"] = optax.tree.norm(gradient)
+    steps, stepped_state = learning.optimizer.update(gradient, optimizer_state, params)
+    stepped = (optax.apply_updates(params, steps), stepped_state)
+    finite = jnp.isfinite(metrics["grad_norm"]) & _is_finite(stepped)
+    metrics = {name: jnp.where(finite, metric, 0.0) for name, metric in metrics.items()}
+    metrics["skipped_steps"] = (any_valid & ~finite).astype(jnp.float32)
+    taken = any_valid & finite
+    metrics["taken_steps"] = taken.astype(jnp.float32)
+    # Adam's momentum would move the parameters even where the gradient is zero.
+    return jax.tree.map(lambda new, old: jnp.where(taken, new, old), stepped, progress), metrics
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    """Tells whether all numbers of a tree are finite: if one is not, their sum is not either."""
+    return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
+
+
+def mean_of_taken(metrics: Metrics) -> Metrics:
+    """Averages the metrics over the steps of an update.
+
+    Args:
+      metrics: Metrics of the update's steps, any shape, from `take`.
+
+    Returns:
+      The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken
+      but some were skipped, the means are -inf. If none was skipped either, the means are 0.
+    """
+    taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
+    # Exactly 1 if all steps of the update were taken.
+    share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
+    # Not NaN: JAX_DEBUG_NANS would take it for a mistake.
+    lost = (taken == 0) & (skipped > 0)
+    means = {n: jnp.where(lost, -jnp.inf, jnp.mean(x) * share) for n, x in metrics.items()}
+    del means["taken_steps"]
+    return means | {"skipped_steps": skipped}

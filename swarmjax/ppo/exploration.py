@@ -1,0 +1,50 @@
+"""The schedule of exploration: the deviation of the action falls in steps, as in PPO-PyTorch."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+
+from swarmjax.ppo.config import AlgoConfig
+
+
+def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
+    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
+
+    Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
+    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
+    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
+
+    Args:
+      config: With `exploration` scheduled.
+
+    Returns:
+      At least one deviation, in action units.
+    """
+    return tuple(_fall(config))
+
+
+def _fall(config: AlgoConfig) -> Iterator[float]:
+    std = config.initial_std
+    yield std
+    while std > config.std_floor:
+        lower = round(std - config.std_decrement, 4)
+        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
+        if lower == std:
+            return
+        std = config.std_floor if lower <= config.std_floor else lower
+        yield std
+
+
+def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
+    """Looks up the deviation of a control step.
+
+    Args:
+      config: With `exploration` scheduled.
+      step: [...], int32, how many control steps came before, at least 0.
+
+    Returns:
+      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
+    """
+    table = jnp.asarray(scheduled_stds(config), dtype=float)
+    return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

@@ -1,0 +1,79 @@
+"""An extension's network in place of the hidden layers: the choice of it, and its checks."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmjax.config import ConfigError, show
+from swarmjax.config.foreign_code import explained
+from swarmjax.extension import Network
+from swarmjax.ppo.config import AlgoConfig
+
+
+def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
+    """Returns the name of the network that a config means.
+
+    Args:
+      config: Names a network, or leaves the choice to the extension.
+      networks: Networks of an extension.
+
+    Raises:
+      ConfigError: The name is unknown, or the extension has several networks and none is named.
+    """
+    names = [piece.name for piece in networks]
+    if config.network is None and len(names) > 1:
+        raise ConfigError(
+            f"extensions holds the networks {', '.join(names)}: choose one, as in "
+            f"algo.network={names[0]}."
+        )
+    name = config.network or [*names, "mlp"][0]
+    if name not in ("mlp", *names):
+        raise ConfigError(
+            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or "
+            "extensions=FILE, a file that defines it."
+        )
+    return name
+
+
+def load(
+    config: AlgoConfig, networks: Sequence[Network], observation: int, state: int
+) -> Callable[[], Any] | None:
+    """Returns what makes the network that a config means; None for hidden layers.
+
+    Args:
+      config: as for `resolve`.
+      networks: as for `resolve`.
+      observation: O.
+      state: P, numbers that the critic sees in addition.
+
+    Raises:
+      ConfigError: the network is missing, fails or does not return features.
+    """
+    name = resolve(config, networks)
+    torso = {piece.name: piece.function for piece in networks}.get(name)
+    if torso is not None:
+        _check_torso(torso, name, observation)
+        if state:
+            _check_torso(torso, f"{name} for a critic of the state", observation + state)
+    return torso
+
+
+def _check_torso(torso: Any, name: str, observation_size: int) -> None:
+    """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
+    seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
+    where = f"network {name}"
+    with explained(f"{where} fails"):
+        made = torso()
+        found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
+    other = sorted(set(variables) - {"params"})
+    if other:
+        raise ConfigError(f"{where} keeps {', '.join(other)}: a network may keep only params.")
+    shape = getattr(found, "shape", ())
+    if len(shape) != 2 or shape[0] != 3 or found.dtype != jnp.float32:
+        kind = getattr(found, "dtype", type(found).__name__)
+        raise ConfigError(
+            f"{where} turns float32 [3, {observation_size}] into {kind} {list(shape)}: return "
+            "float32 [3, F], the features that the heads take."
+        )
