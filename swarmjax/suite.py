@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from swarmjax import command, outputs
-from swarmjax.config import ConfigError, about, files, reading
+from swarmjax.config import ConfigError, about, files, reading, setting
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
@@ -41,12 +41,9 @@ class SuiteConfig(Section):
     command: ClassVar[str] = "suite"
 
     suite: str = field(metadata=about("a name in configs/suites/, or a .yaml file"))
-    out: str | None = field(default=None, metadata=about(".npz file for all of its levels"))
+    out: str | None = setting(None, ".npz file for all of its levels")
     overwrite: bool = field(default=False, metadata=OVERWRITE)
-    write: bool = field(
-        default=False,
-        metadata=about("write digests into the suite's file"),
-    )
+    write: bool = setting(False, "write digests into the suite's file")
 
 
 def main(arguments: Sequence[str]) -> int:

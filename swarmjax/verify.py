@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from swarmjax import command, words
-from swarmjax.config import ConfigError, Section, about, files, show
+from swarmjax.config import ConfigError, Section, about, files, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.exit_codes import FAILED
 from swarmjax.run import directory
@@ -32,15 +32,11 @@ class VerifyConfig(Section):
     command: ClassVar[str] = "verify"
 
     run: str = field(metadata=about("run directory"))
-    updates: int | None = field(
-        default=None,
-        metadata=about(
-            "train at most this many updates; null: to the first checkpoint", 1, MAX_COUNT
-        ),
+    updates: int | None = setting(
+        None, "train at most this many updates; null: to the first checkpoint", 1, MAX_COUNT
     )
-    extensions: str | None = field(
-        default=None,
-        metadata=about("Python file with the pieces that the run needs; it will be executed"),
+    extensions: str | None = setting(
+        None, "Python file with the pieces that the run needs; it will be executed"
     )
 
 

@@ -1,10 +1,10 @@
 """The settings of the curriculum."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import check_options
 from swarmjax.extension import OwnCurriculum
 
@@ -29,74 +29,49 @@ class CurriculumConfig(Section):
     Some options are read only by the modes that their meanings name in brackets.
     """
 
-    mode: str = field(
-        default="mixed",
-        metadata=about(
-            "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
-            "on all stages, more of them on stages with a higher score; or the name of an "
-            "extension's curriculum"
-        ),
+    mode: str = setting(
+        "mixed",
+        "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
+        "on all stages, more of them on stages with a higher score; or the name of an "
+        "extension's curriculum",
     )
-    success: Literal["targets", "all"] = field(
-        default="targets",
-        metadata=about(
-            "measure of success; targets: share of targets reached; all: share of episodes in "
-            "which all robots arrived"
-        ),
+    success: Literal["targets", "all"] = setting(
+        "targets",
+        "measure of success; targets: share of targets reached; all: share of episodes in "
+        "which all robots arrived",
     )
-    threshold: float = field(
-        default=0.8,
-        metadata=about(
-            "success at which training moves on to the next stage [sequential, mixed]",
-            0.0,
-            1.0,
-        ),
+    threshold: float = setting(
+        0.8, "success at which training moves on to the next stage [sequential, mixed]", 0.0, 1.0
     )
-    budget_share: float = field(
-        default=0.5,
-        metadata=about(
-            "share of the budget for all stages before the last, in equal parts "
-            "[sequential, mixed]",
-            above=0.0,
-            below=1.0,
-        ),
+    budget_share: float = setting(
+        0.5,
+        "share of the budget for all stages before the last, in equal parts [sequential, mixed]",
+        above=0.0,
+        below=1.0,
     )
-    score: Literal["learnability", "failure"] = field(
-        default="learnability",
-        metadata=about(
-            "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]"
-        ),
+    score: Literal["learnability", "failure"] = setting(
+        "learnability",
+        "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]",
     )
-    floor: float = field(
-        default=0.1,
-        metadata=about(
-            "share of the arenas spread evenly over all stages [adaptive]", above=0.0, high=1.0
-        ),
+    floor: float = setting(
+        0.1, "share of the arenas spread evenly over all stages [adaptive]", above=0.0, high=1.0
     )
-    shares: Literal["arenas", "robots"] = field(
-        default="arenas",
-        metadata=about(
-            "what the weights divide among stages; robots: a stage with many robots gets fewer "
-            "arenas, so that the samples follow the weights [adaptive]"
-        ),
+    shares: Literal["arenas", "robots"] = setting(
+        "arenas",
+        "what the weights divide among stages; robots: a stage with many robots gets fewer "
+        "arenas, so that the samples follow the weights [adaptive]",
     )
-    optimizer: Literal["keep", "reset"] = field(
-        default="keep",
-        metadata=about("Adam's moments at a promotion; reset: set them to 0 [sequential, mixed]"),
+    optimizer: Literal["keep", "reset"] = setting(
+        "keep", "Adam's moments at a promotion; reset: set them to 0 [sequential, mixed]"
     )
-    exploration: Literal["keep", "reset"] = field(
-        default="keep",
-        metadata=about(
-            "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
-        ),
+    exploration: Literal["keep", "reset"] = setting(
+        "keep", "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
     )
-    levels: Literal["none", "learnability", "value_loss"] = field(
-        default="none",
-        metadata=about(
-            "levels to replay; none: a new level every episode; learnability: those with the "
-            "largest p (1 - p), where p is their success; value_loss: those with the largest "
-            "positive value loss"
-        ),
+    levels: Literal["none", "learnability", "value_loss"] = setting(
+        "none",
+        "levels to replay; none: a new level every episode; learnability: those with the "
+        "largest p (1 - p), where p is their success; value_loss: those with the largest "
+        "positive value loss",
     )
 
     def _check(self) -> None:

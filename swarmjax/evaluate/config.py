@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.outputs import OVERWRITE
 from swarmjax.sim.config import RobotConfig
@@ -34,39 +34,30 @@ class JudgeConfig(Section):
     stage: StageConfig
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
-    suite: str | None = field(
-        default=None,
-        metadata=about("instead of a stage: a name in configs/suites/, or a .yaml or .npz file"),
+    suite: str | None = setting(
+        None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"
     )
-    shape: Shape = field(default="box", metadata=about("shape of a random level's obstacles"))
+    shape: Shape = setting("box", "shape of a random level's obstacles")
     realism: RealismConfig = field(default_factory=RealismConfig)
-    action: Literal["sampled", "mean"] = field(
-        default="sampled",
-        metadata=about(
-            "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
-            "the policy's most likely action"
-        ),
+    action: Literal["sampled", "mean"] = setting(
+        "sampled",
+        "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
+        "the policy's most likely action",
     )
-    steps: int | None = field(
-        default=None,
-        metadata=about(
-            f"control steps of an episode; null: as in the suite's cell, else {STEPS} (Table 1)",
-            1,
-            MOST_STEPS,
-        ),
+    steps: int | None = setting(
+        None,
+        f"control steps of an episode; null: as in the suite's cell, else {STEPS} (Table 1)",
+        1,
+        MOST_STEPS,
     )
-    episodes: int = field(default=1000, metadata=about("episodes", 1, MOST_EPISODES))
-    seed: int = field(default=1, metadata=about("random seed of the levels", 0, MAX_COUNT))
-    workers: int | None = field(
-        default=None, metadata=about("processes; null: one per core", 1, 1024)
+    episodes: int = setting(1000, "episodes", 1, MOST_EPISODES)
+    seed: int = setting(1, "random seed of the levels", 0, MAX_COUNT)
+    workers: int | None = setting(None, "processes; null: one per core", 1, 1024)
+    substeps: int | None = setting(
+        None, "physics steps per control step; null: the body's default", 1, 1000
     )
-    substeps: int | None = field(
-        default=None,
-        metadata=about("physics steps per control step; null: the body's default", 1, 1000),
-    )
-    extensions: str | None = field(
-        default=None,
-        metadata=about("Python file with the policies' extension; it is executed"),
+    extensions: str | None = setting(
+        None, "Python file with the policies' extension; it is executed"
     )
     overwrite: bool = field(default=False, metadata=OVERWRITE)
 
@@ -85,21 +76,14 @@ class EvaluateConfig(JudgeConfig):
 
     command: ClassVar[str] = "evaluate"
 
-    policy: str | None = field(
-        default=None,
-        metadata=about("policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"),
+    policy: str | None = setting(
+        None, "policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"
     )
-    compare: str | None = field(
-        default=None,
-        metadata=about("two recipes instead, compared level by level: a.npz,b.npz, or patterns"),
+    compare: str | None = setting(
+        None, "two recipes instead, compared level by level: a.npz,b.npz, or patterns"
     )
-    engine: Literal["c", "mjx"] = field(
-        default="c", metadata=about("c: MuJoCo's C engine; mjx: the engine of training")
-    )
-    out: str | None = field(
-        default=None,
-        metadata=about("folder for result.json and levels.csv, or a single .json file"),
-    )
+    engine: Literal["c", "mjx"] = setting("c", "c: MuJoCo's C engine; mjx: the engine of training")
+    out: str | None = setting(None, "folder for result.json and levels.csv, or a single .json file")
 
     def _check(self) -> None:
         if (self.policy is None) == (self.compare is None):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from swarmjax.config import ConfigError, Section, about, build, files, reading, show
+from swarmjax.config import ConfigError, Section, about, build, files, reading, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
 from swarmjax.sim.config import MOST_HULL_FRICTION, RobotConfig
@@ -25,27 +25,22 @@ class CellConfig(Section):
 
     name: str = field(metadata=about("of the cell"))
     stage: StageConfig
-    levels: int = field(default=1000, metadata=about("how many", 1, 1_000_000))
+    levels: int = setting(1000, "how many", 1, 1_000_000)
     seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
-    episodes: tuple[int, ...] = field(
-        default=(),
-        metadata=about("numbers of the levels; empty: 0 to levels - 1", 0, MAX_COUNT),
+    episodes: tuple[int, ...] = setting(
+        (), "numbers of the levels; empty: 0 to levels - 1", 0, MAX_COUNT
     )
-    realism: Literal["ideal", "webots", "real"] | None = field(
-        default=None, metadata=about("preset; null: the command's")
+    realism: Literal["ideal", "webots", "real"] | None = setting(
+        None, "preset; null: the command's"
     )
-    steps: int | None = field(
-        default=None,
-        metadata=about("control steps of an episode; null: as set for the command", 1, MOST_STEPS),
+    steps: int | None = setting(
+        None, "control steps of an episode; null: as set for the command", 1, MOST_STEPS
     )
-    hull_friction: float | None = field(
-        default=None,
-        metadata=about("of the robots; null: the command's", 0.0, MOST_HULL_FRICTION),
+    hull_friction: float | None = setting(
+        None, "of the robots; null: the command's", 0.0, MOST_HULL_FRICTION
     )
-    shape: Shape = field(default="box", metadata=about("of the obstacles"))
-    digest: str | None = field(
-        default=None, metadata=about("SHA-256 of the levels; null: not drawn yet")
-    )
+    shape: Shape = setting("box", "of the obstacles")
+    digest: str | None = setting(None, "SHA-256 of the levels; null: not drawn yet")
 
     def _check(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):

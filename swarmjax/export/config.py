@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.outputs import OVERWRITE
 
@@ -14,36 +14,24 @@ class ExportConfig(Section):
 
     command: ClassVar[str] = "export"
 
-    run: str | None = field(
-        default=None, metadata=about("run directory; give either run or policy")
+    run: str | None = setting(None, "run directory; give either run or policy")
+    policy: str | None = setting(None, "path of a policy.npz; give either run or policy")
+    format: Literal["npz", "onnx", "c", "webots"] = setting(
+        "npz", "form of the export: an npz or onnx file, or a folder"
     )
-    policy: str | None = field(
-        default=None, metadata=about("path of a policy.npz; give either run or policy")
+    step: int | None = setting(
+        None, "update of the run's checkpoint; null: the newest valid", 0, MAX_COUNT
     )
-    format: Literal["npz", "onnx", "c", "webots"] = field(
-        default="npz", metadata=about("form of the export: an npz or onnx file, or a folder")
-    )
-    step: int | None = field(
-        default=None,
-        metadata=about("update of the run's checkpoint; null: the newest valid", 0, MAX_COUNT),
-    )
-    seed: int | None = field(
-        default=None, metadata=about("seed of the run's policy; null: all seeds", 0, MAX_COUNT)
-    )
-    out: str | None = field(
-        default=None,
-        metadata=about(
-            "file or folder to write; null: in run or beside policy, named by format and step"
-        ),
+    seed: int | None = setting(None, "seed of the run's policy; null: all seeds", 0, MAX_COUNT)
+    out: str | None = setting(
+        None, "file or folder to write; null: in run or beside policy, named by format and step"
     )
     overwrite: bool = field(default=False, metadata=OVERWRITE)
-    extensions: str | None = field(
-        default=None,
-        metadata=about("Python file with the pieces that the policy needs; it is executed"),
+    extensions: str | None = setting(
+        None, "Python file with the pieces that the policy needs; it is executed"
     )
-    sensors: Literal["webots", "real"] = field(
-        default="webots",
-        metadata=about("sensors of the webots controller: simulated or real e-pucks"),
+    sensors: Literal["webots", "real"] = setting(
+        "webots", "sensors of the webots controller: simulated or real e-pucks"
     )
 
     def _check(self) -> None:

@@ -1,10 +1,10 @@
 """The settings of PPO."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from swarmjax.config import ConfigError, Section, about, show
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
 
 # Options that exist for one choice of another key: this key, and the choice.
@@ -29,156 +29,107 @@ class AlgoConfig(Section):
     Some options are read with one choice of another key alone; their meanings name it in brackets.
     """
 
-    name: Literal["ppo", "paper"] = field(
-        default="ppo", metadata=about("preset that gave the first values", derived=True)
+    name: Literal["ppo", "paper"] = setting(
+        "ppo", "preset that gave the first values", derived=True
     )
-    policy: Literal["shared", "independent"] = field(
-        default="shared", metadata=about("one policy for all agents, or one for each")
+    policy: Literal["shared", "independent"] = setting(
+        "shared", "one policy for all agents, or one for each"
     )
-    network: str | None = field(
-        default=None,
-        metadata=about(
-            "network of actor and critic: mlp or an extension's; null: the extension's, if any"
-        ),
+    network: str | None = setting(
+        None, "network of actor and critic: mlp or an extension's; null: the extension's, if any"
     )
-    hidden_sizes: tuple[int, ...] = field(
-        default=(64, 64), metadata=about("widths of the hidden layers", 1, 4096)
+    hidden_sizes: tuple[int, ...] = setting((64, 64), "widths of the hidden layers", 1, 4096)
+    memory: Literal["none", "gru"] = setting(
+        "none", "memory of the robots; gru: a gated recurrent unit after the layers"
     )
-    memory: Literal["none", "gru"] = field(
-        default="none",
-        metadata=about("memory of the robots; gru: a gated recurrent unit after the layers"),
+    memory_size: int = setting(64, "size of the memory [memory=gru]", 1, 1024)
+    critic: Literal["observation", "state"] = setting(
+        "observation",
+        "what the critic sees; state: also targets, other robots, walls, the distance to go "
+        "and the direction of the path, none of which the policy sees",
     )
-    memory_size: int = field(default=64, metadata=about("size of the memory [memory=gru]", 1, 1024))
-    critic: Literal["observation", "state"] = field(
-        default="observation",
-        metadata=about(
-            "what the critic sees; state: also targets, other robots, walls, the distance to go "
-            "and the direction of the path, none of which the policy sees"
-        ),
+    activation: Literal["tanh", "relu", "swish"] = setting(
+        "tanh", "activation of the hidden layers"
     )
-    activation: Literal["tanh", "relu", "swish"] = field(
-        default="tanh", metadata=about("activation of the hidden layers")
+    mean_activation: Literal["linear", "tanh"] = setting(
+        "linear",
+        "activation of the mean action; tanh: keeps the action within the range of the commands",
     )
-    mean_activation: Literal["linear", "tanh"] = field(
-        default="linear",
-        metadata=about(
-            "activation of the mean action; tanh: keeps the action within the range of the commands"
-        ),
+    initialization: Literal["orthogonal", "uniform"] = setting(
+        "orthogonal", "first weights; uniform: within 1 / sqrt(inputs), biases too, as in PyTorch"
     )
-    initialization: Literal["orthogonal", "uniform"] = field(
-        default="orthogonal",
-        metadata=about(
-            "first weights; uniform: within 1 / sqrt(inputs), biases too, as in PyTorch"
-        ),
+    normalize_observations: bool = setting(
+        True, "scale observations by their running mean and deviation; false: raw, clipped to +-10"
     )
-    normalize_observations: bool = field(
-        default=True,
-        metadata=about(
-            "scale observations by their running mean and deviation; false: raw, clipped to +-10"
-        ),
+    rollout_length: int = setting(32, "control steps per update", 1, MAX_COUNT)
+    epochs: int = setting(1, "passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
+    num_minibatches: int = setting(8, "gradient steps per pass; must divide arenas", 1, MAX_COUNT)
+    discount: float = setting(
+        0.998, "discount per control step: 'discount factor (gamma)'", 0.0, 1.0
     )
-    rollout_length: int = field(
-        default=32, metadata=about("control steps per update", 1, MAX_COUNT)
+    advantage: Literal["gae", "monte_carlo"] = setting(
+        "gae",
+        "gae: bootstrapped, also at the step limit; monte_carlo: returns to the end of the "
+        "episode or rollout, normalised, for both critic and advantages",
     )
-    epochs: int = field(
-        default=1, metadata=about("passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
+    gae_lambda: float = setting(0.95, "GAE's lambda [advantage=gae]", 0.0, 1.0)
+    clip_epsilon: float = setting(
+        0.2, "range of the probability ratio: 'PPO epsilon clip'", above=0.0
     )
-    num_minibatches: int = field(
-        default=8, metadata=about("gradient steps per pass; must divide arenas", 1, MAX_COUNT)
+    actor_learning_rate: float | None = setting(
+        None,
+        "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in "
+        "proportion in a run of more than 15000 gradient steps",
+        above=0.0,
+        high=1.0,
     )
-    discount: float = field(
-        default=0.998,
-        metadata=about("discount per control step: 'discount factor (gamma)'", 0.0, 1.0),
+    critic_learning_rate: float | None = setting(
+        None,
+        "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same way",
+        above=0.0,
+        high=1.0,
     )
-    advantage: Literal["gae", "monte_carlo"] = field(
-        default="gae",
-        metadata=about(
-            "gae: bootstrapped, also at the step limit; monte_carlo: returns to the end of the "
-            "episode or rollout, normalised, for both critic and advantages"
-        ),
+    learning_rate_schedule: Literal["constant", "linear"] = setting(
+        "linear", "linear falls to 0 at the end of the budget"
     )
-    gae_lambda: float = field(
-        default=0.95, metadata=about("GAE's lambda [advantage=gae]", 0.0, 1.0)
+    adam_epsilon: float = setting(1e-5, "added to the root of Adam's second moment", above=0.0)
+    max_grad_norm: float | None = setting(
+        0.5, "norm at which gradients are clipped; null: no clipping", above=0.0
     )
-    clip_epsilon: float = field(
-        default=0.2,
-        metadata=about("range of the probability ratio: 'PPO epsilon clip'", above=0.0),
+    value_cost: float = setting(0.5, "weight of the value loss, half the mean squared error", 0.0)
+    entropy_cost: float = setting(0.0, "weight of the entropy", 0.0)
+    bound_cost: float = setting(
+        1500.0, "weight of the squared distance of the mean action from -1..1", 0.0
     )
-    actor_learning_rate: float | None = field(
-        default=None,
-        metadata=about(
-            "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in "
-            "proportion in a run of more than 15000 gradient steps",
-            above=0.0,
-            high=1.0,
-        ),
+    update_backend: Literal["auto", "autodiff", "fused"] = setting(
+        "auto",
+        "how to compute gradients; fused: GPU kernels, with minibatches of tiles of valid "
+        "samples; auto: fused on an NVIDIA GPU if the kernels support the layers; with a "
+        "memory, autodiff that leaves out the rollouts of absent robots",
     )
-    critic_learning_rate: float | None = field(
-        default=None,
-        metadata=about(
-            "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same "
-            "way",
-            above=0.0,
-            high=1.0,
-        ),
+    exploration: Literal["learned", "scheduled"] = setting(
+        "learned", "deviation of the action: learned, or falling in steps by a schedule"
     )
-    learning_rate_schedule: Literal["constant", "linear"] = field(
-        default="linear", metadata=about("linear falls to 0 at the end of the budget")
+    initial_std: float = setting(
+        0.6, "first deviation: 'starting std of action distribution'", above=0.0
     )
-    adam_epsilon: float = field(
-        default=1e-5, metadata=about("added to the root of Adam's second moment", above=0.0)
+    std_decrement: float = setting(
+        0.05,
+        "decrease of the deviation at a time: 'the decay rate of std of action distribution' "
+        "[exploration=scheduled]",
+        above=0.0,
     )
-    max_grad_norm: float | None = field(
-        default=0.5,
-        metadata=about("norm at which gradients are clipped; null: no clipping", above=0.0),
+    std_interval: int = setting(
+        250_000,
+        "control steps of all arenas between decreases: 'decay frequency of std of action "
+        "distribution' [exploration=scheduled]",
+        1,
+        MAX_COUNT,
     )
-    value_cost: float = field(
-        default=0.5, metadata=about("weight of the value loss, half the mean squared error", 0.0)
-    )
-    entropy_cost: float = field(default=0.0, metadata=about("weight of the entropy", 0.0))
-    bound_cost: float = field(
-        default=1500.0,
-        metadata=about("weight of the squared distance of the mean action from -1..1", 0.0),
-    )
-    update_backend: Literal["auto", "autodiff", "fused"] = field(
-        default="auto",
-        metadata=about(
-            "how to compute gradients; fused: GPU kernels, with minibatches of tiles of valid "
-            "samples; auto: fused on an NVIDIA GPU if the kernels support the layers; with a "
-            "memory, autodiff that leaves out the rollouts of absent robots"
-        ),
-    )
-    exploration: Literal["learned", "scheduled"] = field(
-        default="learned",
-        metadata=about("deviation of the action: learned, or falling in steps by a schedule"),
-    )
-    initial_std: float = field(
-        default=0.6,
-        metadata=about("first deviation: 'starting std of action distribution'", above=0.0),
-    )
-    std_decrement: float = field(
-        default=0.05,
-        metadata=about(
-            "decrease of the deviation at a time: 'the decay rate of std of action distribution' "
-            "[exploration=scheduled]",
-            above=0.0,
-        ),
-    )
-    std_interval: int = field(
-        default=250_000,
-        metadata=about(
-            "control steps of all arenas between decreases: 'decay frequency of std of action "
-            "distribution' [exploration=scheduled]",
-            1,
-            MAX_COUNT,
-        ),
-    )
-    std_floor: float = field(
-        default=0.1,
-        metadata=about(
-            "least deviation: 'minimum std of action distribution' [exploration=scheduled]",
-            above=0.0,
-        ),
+    std_floor: float = setting(
+        0.1,
+        "least deviation: 'minimum std of action distribution' [exploration=scheduled]",
+        above=0.0,
     )
 
     def _check(self) -> None:

@@ -1,10 +1,10 @@
 """The settings of a reproduction."""
 
 import typing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, about
+from swarmjax.config import ConfigError, Section, setting
 from swarmjax.config.section import MAX_COUNT as _MOST
 from swarmjax.evaluate.statistics import LEAST_DRAWN
 
@@ -27,19 +27,15 @@ class ReproduceConfig(Section):
 
     command: ClassVar[str] = "reproduce"
 
-    seeds: int = field(default=10, metadata=about("seeds of each arm", LEAST_DRAWN, 4096))
-    budget: int = field(default=1_000_000, metadata=about("control steps of a seed", UPDATE, _MOST))
-    fine_tune: int = field(default=250_000, metadata=about("the same at 1.5 m", UPDATE, _MOST))
-    arms: tuple[Arm, ...] = field(
-        default=ARMS, metadata=about("arms to train; NAME_expanded continues arm NAME")
+    seeds: int = setting(10, "seeds of each arm", LEAST_DRAWN, 4096)
+    budget: int = setting(1_000_000, "control steps of a seed", UPDATE, _MOST)
+    fine_tune: int = setting(250_000, "the same at 1.5 m", UPDATE, _MOST)
+    arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
+    minutes: float | None = setting(
+        None, "save and stop after this time; resume continues", above=0.0
     )
-    minutes: float | None = field(
-        default=None, metadata=about("save and stop after this time; resume continues", above=0.0)
-    )
-    out: str | None = field(
-        default=None, metadata=about("directory; null: runs/<date>-<time>-reproduce")
-    )
-    resume: str | None = field(default=None, metadata=about("reproduction to continue"))
+    out: str | None = setting(None, "directory; null: runs/<date>-<time>-reproduce")
+    resume: str | None = setting(None, "reproduction to continue")
 
     def _check(self) -> None:
         if not self.arms:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from swarmjax.config import Section, about
+from swarmjax.config import Section, about, setting
 from swarmjax.config.section import MAX_COUNT, ByName
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.ppo.config import AlgoConfig
@@ -27,62 +27,46 @@ class ProgramConfig(Section):
     algo: AlgoConfig = field(default_factory=AlgoConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     sim: SimConfig = field(default_factory=SimConfig)
-    seed: int = field(default=0, metadata=about("random seed", 0, MAX_COUNT))
-    seeds: int = field(
-        default=1,
-        metadata=about(
-            "number of runs trained at once, with seeds seed, seed + 1, ...",
-            1,
-            4096,
-            reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
-            "a second run, with seed=4096",
-        ),
+    seed: int = setting(0, "random seed", 0, MAX_COUNT)
+    seeds: int = setting(
+        1,
+        "number of runs trained at once, with seeds seed, seed + 1, ...",
+        1,
+        4096,
+        reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
+        "a second run, with seed=4096",
     )
-    seeds_by: Literal["vmap", "cores", "devices"] = field(
-        default="vmap",
-        metadata=about(
-            "how to train the seeds; vmap: side by side; cores: vmap, in a group for each core of "
-            "a CPU; devices: vmap, in a group for each device"
-        ),
+    seeds_by: Literal["vmap", "cores", "devices"] = setting(
+        "vmap",
+        "how to train the seeds; vmap: side by side; cores: vmap, in a group for each core of "
+        "a CPU; devices: vmap, in a group for each device",
     )
-    arenas: int = field(
-        default=128,
-        metadata=about("arenas simulated at once", 1, 2**20),
+    arenas: int = setting(128, "arenas simulated at once", 1, 2**20)
+    devices: int = setting(
+        1,
+        "number of devices that share the arenas of every seed; with seeds_by=devices, they "
+        "share the seeds",
+        1,
+        2**16,
     )
-    devices: int = field(
-        default=1,
-        metadata=about(
-            "number of devices that share the arenas of every seed; with seeds_by=devices, they "
-            "share the seeds",
-            1,
-            2**16,
-        ),
+    streams: int | None = setting(
+        None,
+        "random streams, a multiple of devices; runs with equal streams draw the same numbers "
+        "on any number of devices; null: devices",
+        1,
+        2**16,
     )
-    streams: int | None = field(
-        default=None,
-        metadata=about(
-            "random streams, a multiple of devices; runs with equal streams draw the same numbers "
-            "on any number of devices; null: devices",
-            1,
-            2**16,
-        ),
-    )
-    budget: int = field(
-        default=3_000_000, metadata=about("control steps of all arenas together", 1, 10**15)
-    )
-    levels_per_rollout: int | None = field(
-        default=None,
-        metadata=about(
-            "levels drawn for each arena before a rollout; an arena that needs more repeats the "
-            "last one, which then counts for no success; null: one for each 32 control steps",
-            1,
-            1024,
-        ),
+    budget: int = setting(3_000_000, "control steps of all arenas together", 1, 10**15)
+    levels_per_rollout: int | None = setting(
+        None,
+        "levels drawn for each arena before a rollout; an arena that needs more repeats the "
+        "last one, which then counts for no success; null: one for each 32 control steps",
+        1,
+        1024,
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
-    extensions: str | None = field(
-        default=None,
-        metadata=about("Python file with your own extension; it is executed", stored=False),
+    extensions: str | None = setting(
+        None, "Python file with your own extension; it is executed", stored=False
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
