@@ -101,7 +101,8 @@ def test_a_video_of_the_user_is_refused() -> None:
 @pytest.mark.usefixtures("folder")
 def test_a_reproduction_wants_an_empty_folder() -> None:
     assert refusal(reproduce.main, ["out=run"]) == (
-        "out is run, which is not empty: give a new or an empty folder."
+        "out is run, which is not empty: give a new or an empty folder, or resume=run to go on "
+        "with the reproduction in it."
     )
 
 

@@ -185,7 +185,7 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     check_text(key, choice)
     if is_path(choice):
         if not Path(choice).exists():
-            raise ConfigError(f"{key} is {show(choice)}, and there is no such file.")
+            raise ConfigError(f"{key} is '{choice}', and there is no such file.")
         return Path(choice)
     names = choices(folder)
     if choice not in names:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
+from swarmjax.extension import Network
 
 # Options that exist for one choice of another key: this key, and the choice.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
@@ -178,3 +179,28 @@ class AlgoConfig(Section):
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "
                 "with hidden layers: give network=mlp or memory=none."
             )
+
+
+def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
+    """Returns the name of the network that a config means.
+
+    Args:
+      config: Names a network, or leaves the choice to the extension.
+      networks: Networks of an extension.
+
+    Raises:
+      ConfigError: The name is unknown, or the extension has several networks and none is named.
+    """
+    names = [piece.name for piece in networks]
+    if config.network is None and len(names) > 1:
+        raise ConfigError(
+            f"extensions holds the networks {', '.join(names)}: choose one, as in "
+            f"algo.network={names[0]}."
+        )
+    name = config.network or [*names, "mlp"][0]
+    if name not in ("mlp", *names):
+        raise ConfigError(
+            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or "
+            "extensions=FILE, a file that defines it."
+        )
+    return name

@@ -1,4 +1,4 @@
-"""An extension's network in place of the hidden layers: the choice of it, and its checks."""
+"""An extension's network in place of the hidden layers: its checks."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,35 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from swarmjax.config import ConfigError, show
+from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import Network
-from swarmjax.ppo.config import AlgoConfig
-
-
-def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
-    """Returns the name of the network that a config means.
-
-    Args:
-      config: Names a network, or leaves the choice to the extension.
-      networks: Networks of an extension.
-
-    Raises:
-      ConfigError: The name is unknown, or the extension has several networks and none is named.
-    """
-    names = [piece.name for piece in networks]
-    if config.network is None and len(names) > 1:
-        raise ConfigError(
-            f"extensions holds the networks {', '.join(names)}: choose one, as in "
-            f"algo.network={names[0]}."
-        )
-    name = config.network or [*names, "mlp"][0]
-    if name not in ("mlp", *names):
-        raise ConfigError(
-            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or "
-            "extensions=FILE, a file that defines it."
-        )
-    return name
+from swarmjax.ppo.config import AlgoConfig, resolve
 
 
 def load(

@@ -9,7 +9,7 @@ from swarmjax import extension
 from swarmjax.config import ConfigError, build, check_text, files, inherit, reading, show, to_dict
 from swarmjax.config.section import build_stored
 from swarmjax.curriculum.config import check_mode
-from swarmjax.ppo.own_network import resolve
+from swarmjax.ppo.config import resolve
 from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.run.settings import TrainConfig

@@ -201,8 +201,8 @@ def test_what_a_suite_has_not_is_refused(steer, suite):
     assert refusal(replay.main, [*words, "worst=6"]) == (
         "worst is 6: give 1 to 5, the levels there are."
     )
-    assert refusal(load_levels, ReplayConfig, [*words, "level=4"]) == (
-        f"suite is '{suite}': say which levels, as in worst=5."
+    assert refusal(load_levels, ReplayConfig, [*words, "level=4"]).endswith(
+        ": say which levels, as in worst=5."
     )
     assert refusal(load_levels, ReplayConfig, [*words, "worst=1", "seed=3"]).startswith(
         "seed cannot be given with"

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -88,18 +89,25 @@ def test_levels_noise_and_shuffles_are_drawn_by_keys_of_their_own(
 ) -> None:
     keys = []
     state = start()
+    split = jax.random.split
 
-    def taken(*arguments: Any, **_: Any) -> Any:
-        """Keeps the key, which is the last argument of each of the three."""
+    def take(*arguments: Any, **_: Any) -> Any:
+        """Keeps the key, which is the last argument."""
         keys.append(tuple(jax.random.key_data(arguments[-1]).tolist()))
-        if len(keys) == 3:
-            raise StopIteration
-        return None, None, None
+        return None, SimpleNamespace(valid=np.zeros((1, 1))), None
 
-    monkeypatch.setattr(loop, "_draw", taken)
-    monkeypatch.setattr(rollout, "collect", taken)
+    def split_once(key: jax.Array, number: int) -> jax.Array:
+        """Splits the key of an update, and then takes that of its learning."""
+        if keys:
+            take(key)
+            raise StopIteration
+        return split(key, number)
+
+    monkeypatch.setattr(loop, "_draw", take)
+    monkeypatch.setattr(rollout, "collect", take)
     monkeypatch.setattr(rollout, "batch", lambda *_: None)
-    monkeypatch.setattr(loop, "_learn", taken)
+    monkeypatch.setattr(rollout, "explore", lambda *_: None)
+    monkeypatch.setattr(jax.random, "split", split_once)
     with pytest.raises(StopIteration):
         loop.update(program, programs.schedule(program.config), state)
     keys.append(tuple(jax.random.key_data(state.key).tolist()))
