@@ -230,7 +230,9 @@ def test_a_run_on_another_machine_is_judged_by_what_it_writes(
 
 
 @pytest.mark.parametrize(
-    ("process", "is_written"), [(os.getpid(), True), (2**22 + 1, False), (2**70, False)]
+    ("process", "is_written"),
+    [(os.getpid(), True), (2**22 + 1, False), (2**70, False)],
+    ids=["own", "too large", "far too large"],  # the same in every test process
 )  # the second is above Linux's largest process number
 def test_a_process_that_has_ended_is_not_writing(
     tmp_path: Path, process: int, *, is_written: bool
