@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax import provenance
-from swarmjax.config import ConfigError, Section, build, section, show
+from swarmjax.config import ConfigError, Section, build, files, section
 from swarmjax.config.section import keys
 
 Line = dict[str, Any]
@@ -28,13 +28,11 @@ def load(cls: type[Section], words: Sequence[str]) -> Any:
       ConfigError: if an argument is invalid.
     """
     lists = {name for name, item in keys(cls).items() if "tuple" in str(item.type)}
-    given = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not equals:
-            raise ConfigError(f"{show(word)} is not a setting: give key=value.")
-        given[key] = value.split(",") if key in lists else value
-    return build(cls, given)
+    given = [
+        f"{key}=[{value}]" if key in lists and value[:1] != "[" else f"{key}{equals}{value}"
+        for key, equals, value in (word.partition("=") for word in words)
+    ]
+    return build(cls, files.parse(cls, given))
 
 
 def parse(cls: type[Section], words: Sequence[str]) -> tuple[Any, list[str]]:

@@ -114,12 +114,10 @@ def parse(arguments: Sequence[str]) -> tuple[SweepConfig, list[GridCell]]:
       ConfigError: if a word is invalid, or jobs cannot be submitted here.
     """
     known = section.names(SweepConfig)
-    mine = {key: value for key, _, value in (word.partition("=") for word in arguments)}
-    settings: SweepConfig = build(SweepConfig, {k: v for k, v in mine.items() if k in known})
+    mine = [word for word in arguments if word.partition("=")[0] in known]
+    settings: SweepConfig = build(SweepConfig, files.parse(SweepConfig, mine))
     check_text("dir", settings.dir)
-    cells = multiply(
-        Path(settings.dir), [word for word in arguments if word.partition("=")[0] not in known]
-    )
+    cells = multiply(Path(settings.dir), [word for word in arguments if word not in mine])
     if importlib.util.find_spec("submitit") is None:
         raise ConfigError("submitit is missing: install it with uv sync --extra sweep.")
     for name in ("sbatch", "srun") if settings.cluster == "slurm" else ():

@@ -321,10 +321,10 @@ def test_the_digest_covers_arrays_and_meta(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("{", r"meta cannot be read: "),
+        ("{", r"meta cannot be read as JSON: "),
         ("[1]", r"meta is \[1\]: expected a JSON object"),
-        ('{"format": ' + "9" * 5000 + "}", r"meta cannot be read: "),
-        ("[" * 60_000, r"meta cannot be read: "),
+        ('{"format": ' + "9" * 5000 + "}", r"meta cannot be read as JSON: "),
+        ("[" * 60_000, r"meta cannot be read as JSON: "),
     ],
 )
 def test_read_refuses_foreign_meta(tmp_path: Path, text: str, sentence: str) -> None:

@@ -41,22 +41,37 @@ def new_id() -> str:
 
 
 @contextlib.contextmanager
-def locked(run: Path) -> Iterator[None]:
+def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
     """Keeps other processes out of a run directory, and makes it if it is missing.
 
     Args:
       run: the directory.
+      claimed: whether `claim` has made it. What was made is removed if the run writes nothing.
 
     Raises:
       ConfigError: if another process is writing the directory, or it cannot be written.
     """
+    made = [path for path in (run, *run.parents) if not path.exists()]
+    made = made or [run, run.parent] * claimed
     with contextlib.ExitStack() as held:
         try:
             run.mkdir(parents=True, exist_ok=True)
             _lock(run, held)
         except OSError as error:
             raise unwritable(run, error) from None
-        yield
+        try:
+            yield
+        finally:
+            _remove_empty(run, made)
+
+
+def _remove_empty(run: Path, made: Iterable[Path]) -> None:
+    """Removes the directories that were made, if the run then wrote nothing."""
+    with contextlib.suppress(OSError):  # already removed, not empty, or owned by another user
+        if made and os.listdir(run) == [LOCK]:
+            (run / LOCK).unlink()
+            for path in made:
+                path.rmdir()
 
 
 def _lock(run: Path, held: contextlib.ExitStack) -> None:
@@ -64,6 +79,8 @@ def _lock(run: Path, held: contextlib.ExitStack) -> None:
     file = held.enter_context((run / LOCK).open("a+"))
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.fstat(file.fileno()).st_nlink:  # removed by its holder between open and lock
+            raise BlockingIOError
     except BlockingIOError:
         file.seek(0)
         holder = file.readline().strip() or "another process"

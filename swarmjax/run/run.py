@@ -136,7 +136,8 @@ class Run:
             yield
             return
         chosen = self._choose_path() if hosts.is_first() else Path()
-        with hosts.own_directory(chosen) as self.path, directory.locked(self.path):
+        claimed = self.settings.run.dir is None
+        with hosts.own_directory(chosen) as self.path, directory.locked(self.path, claimed=claimed):
             if hosts.is_first():  # the other processes' folders link to the first one's checkpoints
                 check_free(self.path, self.settings)
             name = self.settings.run.id or hosts.share_text(directory.new_id())

@@ -101,7 +101,7 @@ def test_a_step_needs_the_action_of_a_policy_that_remembers(tmp_path: Path) -> N
     trained = policies.saved(tmp_path / "recalls.npz", given, **said)
     judge = dataclasses.replace(_judge(tmp_path, _stage()), policy=trained)
     arenas = _start(judge, [[-0.1, 0.2, 0.0]])
-    with pytest.raises(PolicyError, match=r"^the policy has a memory: pass the action that `ByPo"):
+    with pytest.raises(PolicyError, match=r"^the policy has a memory: pass the action that `act` "):
         engine_c.step(judge, arenas)
 
 

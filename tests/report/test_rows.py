@@ -113,9 +113,9 @@ def test_a_file_that_is_not_there_is_named(file: str, what: str, tmp_path: Path)
         ),
         ("curriculum.jsonl", '{"seed": 0, "upd\n', " in line 1 is damaged: resume the run"),
         ("curriculum.jsonl", '{"seed": 0}\n', " in line 1 has no whole number as update: it is"),
-        ("config.json", "{", " cannot be read: "),
+        ("config.json", "{", " cannot be read as JSON: "),
         ("config.json", "[]", " is not a run's config: it holds no JSON object."),
-        ("summary.json", "{", " cannot be read: "),
+        ("summary.json", "{", " cannot be read as JSON: "),
     ],
 )
 def test_a_damaged_file_is_named_with_its_line(

@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from sentences import refusal
 
 from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
@@ -170,14 +169,6 @@ def test_a_resumed_run_writes_the_same_episodes(
     train_for(tmp_path, 6, resume=True)
     expected = (whole / "episodes.jsonl").read_text()
     assert (tmp_path / "episodes.jsonl").read_text() == expected
-
-
-def test_a_log_of_too_many_arenas_is_refused() -> None:
-    assert refusal(load_train, ["arenas=65536", "budget=1e9", "run.episodes=true"]) == (
-        "run.episodes is true, but arenas is 65536 and seeds is 1: give at most 8192 arenas of all "
-        "seeds together, or run.episodes=false."
-    )
-    assert load_train(["arenas=4096", "seeds=2", "budget=1e9", "run.episodes=true"]).run.episodes
 
 
 @pytest.mark.parametrize("count", [1, 3])
