@@ -17,10 +17,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
-    "code lines of swarmjax": 22_450,
+    "code lines of swarmjax": 19_000,
     "code lines of benchmarks": 4_500,
-    "keys of train": 159,
-    "longest file": 584,
+    "keys of train": 144,
+    "longest file": 450,
     "longest function": 60,
 }
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -168,4 +169,25 @@ def test_a_file_system_without_locks_is_named(
     monkeypatch.setattr(fcntl, "flock", refuse)
     refused = pytest.raises(ConfigError, match="cannot be written: No locks available")
     with refused, directory.locked(tmp_path):
+        pass
+
+
+def test_a_claimed_directory_that_stays_empty_is_removed(tmp_path: Path) -> None:
+    run = directory.claim(tmp_path / "runs", "now")
+    with directory.locked(run, claimed=True):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_that_its_holder_removes_meanwhile_is_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = fcntl.flock
+
+    def remove_first(file: Any, how: int) -> None:
+        (tmp_path / directory.LOCK).unlink()  # like a process that held the lock and wrote nothing
+        lock(file, how)
+
+    monkeypatch.setattr(fcntl, "flock", remove_first)
+    with pytest.raises(ConfigError, match="another process is writing"), directory.locked(tmp_path):
         pass
