@@ -401,7 +401,7 @@ def _exported(learner: LearnerState) -> Arrays:
 def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any) -> None:
     config = AlgoConfig(hidden_sizes=(64, 64), activation=activation)
     ppo = PPO.make(config, Sizes(SIZE, ACTIONS), updates=1)
-    learner = ppo.init(jax.random.key(0))
+    learner = jax.jit(ppo.init)(jax.random.key(0))
     draw = np.random.default_rng(4)
     # The last layer starts with a gain of 0.01, which is too small to tell networks apart.
     params = jax.tree.map(
@@ -416,7 +416,7 @@ def test_mean_action_is_the_mode_of_the_learner(tmp_path: Path, activation: Any)
     loaded = saved(tmp_path / "policy.npz", _exported(learner), activation=activation)
     # Thirty deviations reach beyond the normaliser's limit of 10.
     seen = draw.normal(size=(40, 3, SIZE)).astype(np.float32) * spread * 30
-    expected = np.asarray(ppo.act(learner, jnp.asarray(seen), jnp.zeros((40, 3, ACTIONS)))[0])
+    expected = np.asarray(jax.jit(ppo.act)(learner, seen, jnp.zeros((40, 3, ACTIONS)))[0])
     assert np.ptp(expected, axis=(0, 1)).min() > 1.0  # The observation matters.
     # Three sums of 64 float32 terms or fewer are added in another order. Each is off by about
     # 64 * 2**-24 = 4e-6 of its largest term, which is below 10.

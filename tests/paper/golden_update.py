@@ -1,6 +1,6 @@
 """Runs our update on the golden batch and measures its errors against the golden numbers.
 
-As a program, it prints the errors as JSON. With JAX_ENABLE_X64=1, all numbers are float64.
+As a program, `golden_update.py CASE` prints the errors as JSON. With JAX_ENABLE_X64=1, all numbers are float64.
 """
 
 import functools
@@ -39,7 +39,7 @@ def ppo(config: AlgoConfig) -> PPO:
 
 def learner(config: AlgoConfig) -> LearnerState:
     """Returns a batch of one learner, [1], with the golden weights."""
-    state = ppo(config).init(jax.random.key(0))
+    state = jax.jit(ppo(config).init)(jax.random.key(0))
     drawn = inputs.draw().layers
     params = {
         network: {
@@ -76,9 +76,9 @@ def trajectory(state: LearnerState, config: AlgoConfig, idle: int = 0) -> Trajec
     observation = jnp.asarray(drawn.observation, float)
     # `act` uses the learner's current deviation, which here is the same for the whole batch.
     noise = jnp.asarray(drawn.noise, float)
-    action, log_prob, _ = ppo(config).act(alone, observation, noise)
+    action, log_prob, _ = jax.jit(ppo(config).act)(alone, observation, noise)
     terminated, truncated = inputs.ends(inputs.ARRIVALS), inputs.ends(inputs.TIME_OUTS)
-    value, _ = ppo(config).value(alone, observation)
+    value, _ = jax.jit(ppo(config).value)(alone, observation)
     columns = Trajectory(
         observation=observation,
         action=action,
@@ -140,7 +140,7 @@ def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict
     state = learner(config)
     made, steps = ppo(config), inputs.STEPS + (case == "std")
     path = trajectory(state, config, idle)
-    batch = made.batch(path, NO_MEMORY, jnp.zeros(path.valid.shape[:2], bool))
+    batch = jax.jit(made.batch)(path, NO_MEMORY, jnp.zeros(path.valid.shape[:2], bool))
     batch = jax.tree.map(lambda x: x[None], batch)
     state = jax.vmap(lambda one: made.explore(one, steps))(state)
     found = {}
@@ -160,6 +160,7 @@ def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict
 
 
 if __name__ == "__main__":
-    cases = {case: errors(case) for case in CONFIGS}
-    cases["waiting"] = errors("terminal", idle=50, trained=(1,))
-    sys.stdout.write(json.dumps(cases))
+    waiting = {"idle": 50, "trained": (1,)}
+    case = sys.argv[1]
+    found = errors("terminal", **waiting) if case == "waiting" else errors(case)
+    sys.stdout.write(json.dumps(found))

@@ -14,12 +14,11 @@ DOUBLE = {"returns": 1e-10, "advantages": 1e-10, "loss_1": 1e-9, "loss_80": 1e-9
 DOUBLE |= {"params_1": 1e-8, "params_80": 1e-6}  # relative error in norm
 
 
-@pytest.fixture(scope="module")
-def double() -> dict[str, dict[str, float]]:
+def _double(case: str) -> dict[str, float]:
     """Returns the float64 errors, from a separate process because a process has one precision."""
     program = Path(__file__).with_name("golden_update.py")
     found = subprocess.run(
-        [sys.executable, str(program)],
+        [sys.executable, str(program), case],
         env=os.environ | {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
@@ -33,15 +32,15 @@ def double() -> dict[str, dict[str, float]]:
     ("case", "compared"),
     [
         ("terminal", set(DOUBLE)),
-        ("std", {"loss_1", "loss_80"}),
+        pytest.param("std", {"loss_1", "loss_80"}, marks=pytest.mark.slow),
         # Steps in which an arrived robot waits must not affect the update.
-        ("waiting", {"returns", "advantages", "loss_1", "params_1"}),
+        pytest.param(
+            "waiting", {"returns", "advantages", "loss_1", "params_1"}, marks=pytest.mark.slow
+        ),
     ],
 )
-def test_an_update_is_theirs_in_double_precision(
-    case: str, compared: set[str], double: dict[str, dict[str, float]]
-) -> None:
-    found = double[case]
+def test_an_update_is_theirs_in_double_precision(case: str, compared: set[str]) -> None:
+    found = _double(case)
     assert set(found) == compared
     assert all(found[name] <= DOUBLE[name] for name in compared), found
 

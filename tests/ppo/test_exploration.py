@@ -49,7 +49,7 @@ def _std(state: LearnerState) -> np.ndarray:
 
 
 def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
-    state = PPO_.init(jax.random.key(0))
+    state = jax.jit(PPO_.init)(jax.random.key(0))
     for steps, explored, std in ((100, 100, 0.6), (1, 101, 0.55), (99, 200, 0.55), (60, 260, 0.5)):
         state = PPO_.explore(state, steps)
         assert state.explored == explored
@@ -61,7 +61,7 @@ def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
 
 
 def test_the_count_of_steps_does_not_wrap() -> None:
-    state = PPO_.init(jax.random.key(0))
+    state = jax.jit(PPO_.init)(jax.random.key(0))
     state = replace(state, explored=jnp.int32(2**31 - 50))
     for _ in range(2):
         state = PPO_.explore(state, 100)
@@ -79,7 +79,7 @@ def test_without_a_schedule_a_learner_stays_as_it_is() -> None:
 
 @pytest.mark.slow
 def test_an_update_leaves_a_scheduled_deviation_alone() -> None:
-    state = PPO_.explore(PPO_.init(jax.random.key(0)), 150)
+    state = PPO_.explore(jax.jit(PPO_.init)(jax.random.key(0)), 150)
     observation, action = jax.random.normal(jax.random.key(1), (2, 4, 6, 3))
     action = action[..., :2]
     batch = Batch(

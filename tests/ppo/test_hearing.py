@@ -36,7 +36,7 @@ def _ppo(config: AlgoConfig, state: int = 0) -> PPO:
 
 def _learner(ppo: PPO) -> LearnerState:
     """Returns a learner whose weights have noise added, since new output layers are near 0."""
-    made = ppo.init(jax.random.key(0))
+    made = jax.jit(ppo.init)(jax.random.key(0))
     leaves, tree = jax.tree.flatten(made.params)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     drawn = [x + 0.3 * jax.random.normal(key, x.shape) for x, key in zip(leaves, keys, strict=True)]
@@ -61,8 +61,9 @@ def _think(kind: str, own: np.ndarray, rows: np.ndarray) -> tuple[Any, Any]:
     ppo = _ppo(config, STATE if sees else 0)
     mine, memory = _learner(ppo), ppo.begin_memory(())
     seen = jnp.concatenate([jnp.asarray(own), jnp.asarray(rows).ravel()])
-    action, _, _ = ppo.act(mine, seen, jnp.zeros(3), memory.actor)
-    value, _ = ppo.value(mine, seen, jnp.array([0.5, -0.5]) if sees else (), memory.critic)
+    state = jnp.array([0.5, -0.5]) if sees else ()
+    action, _, _ = jax.jit(ppo.act)(mine, seen, jnp.zeros(3), memory.actor)
+    value, _ = jax.jit(ppo.value)(mine, seen, state, memory.critic)
     return np.asarray(action), np.asarray(value)
 
 
@@ -95,7 +96,7 @@ def test_what_is_heard_is_the_sum_of_one_layer_of_each() -> None:
 
 
 def test_a_policy_that_does_not_hear_has_the_weights_that_it_had() -> None:
-    made = learners.ppo(PLAIN, Sizes(SIZE, 2)).init(jax.random.key(0))
+    made = jax.jit(learners.ppo(PLAIN, Sizes(SIZE, 2)).init)(jax.random.key(0))
     assert "hearing" not in made.params["actor"]
 
 

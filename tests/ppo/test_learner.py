@@ -49,7 +49,7 @@ def _batch(state: LearnerState, seed: int = 0, config: AlgoConfig = CONFIG) -> B
 
 
 def _fresh(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
-    return _ppo(config).init(jax.random.key(seed))
+    return jax.jit(_ppo(config).init)(jax.random.key(seed))
 
 
 def _experienced(seed: int = 0, config: AlgoConfig = CONFIG) -> LearnerState:
@@ -175,7 +175,8 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
         return_=batch.return_[valid],
         valid=jnp.ones(valid.sum(), bool),
     )
-    (_, expected), gradient = jax.value_and_grad(gradients.ppo_loss, has_aux=True)(
+    loss = jax.value_and_grad(gradients.ppo_loss, has_aux=True)
+    (_, expected), gradient = jax.jit(loss, static_argnums=(2, 3))(
         state.params,
         minibatch,
         _ppo(ONE_STEP).learning.networks,

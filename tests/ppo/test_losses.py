@@ -19,8 +19,9 @@ CONFIG = AlgoConfig(
     hidden_sizes=(8,), clip_epsilon=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4
 )
 NETS = learners.nets(CONFIG, OBSERVATION, U)
-PARAMS = NETS.init(jax.random.key(0))
+PARAMS = jax.jit(NETS.init)(jax.random.key(0))
 PARAMS["actor"]["mean"]["kernel"] *= 150.0  # so that means lie on both sides of -1 and of 1
+_loss = jax.jit(ppo_loss, static_argnums=(2, 3))
 
 
 def _minibatch(valid_share: float = 0.6) -> Minibatch:
@@ -66,7 +67,7 @@ def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
 @pytest.mark.parametrize("expected_valid", [0.25, 5.0, 14.0])
 def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
     minibatch = _minibatch()
-    loss, metrics = ppo_loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(expected_valid))
+    loss, metrics = _loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(expected_valid))
     expected = _expected(minibatch, expected_valid)
     assert expected["clip_fraction"] > 0.0
     assert expected["bound_loss"] > 0.0
@@ -82,6 +83,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
     mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
     log_prob = gradients.log_density(mean, std, minibatch.action)
     config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0, bound_cost=0.0)
+    loss = jax.jit(jax.grad(ppo_loss, has_aux=True), static_argnums=(2, 3))
 
     def slope(ratio: float, advantage: float) -> float:
         samples = replace(
@@ -90,7 +92,7 @@ def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
             advantage=np.full(B, advantage, np.float32),
             valid=np.ones(B, bool),
         )
-        gradient = jax.grad(lambda p: ppo_loss(p, samples, NETS, config, jnp.float32(B))[0])(PARAMS)
+        gradient, _ = loss(PARAMS, samples, NETS, config, jnp.float32(B))
         return float(jnp.abs(gradient["actor"]["mean"]["kernel"]).max())
 
     # The minimum in equation 7 of the PPO paper is flat only where the ratio has left the clip
@@ -114,8 +116,8 @@ def test_without_a_valid_sample_loss_and_gradient_are_zero() -> None:
 
 def test_float_masks_count_as_boolean_ones() -> None:
     minibatch = _minibatch()
-    expected = ppo_loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(14.0))
-    got = ppo_loss(
+    expected = _loss(PARAMS, minibatch, NETS, CONFIG, jnp.float32(14.0))
+    got = _loss(
         PARAMS,
         replace(minibatch, valid=minibatch.valid.astype(np.float32)),
         NETS,
@@ -130,7 +132,7 @@ def test_mean_over_unevenly_filled_minibatches_is_the_loss_of_the_batch() -> Non
     valid = np.zeros(B, bool)
     valid[[0, 1, 2, 3, 4, 5, 6, 7, 9]] = True
     batch = replace(batch, valid=valid)
-    loss = jax.value_and_grad(ppo_loss, has_aux=True)
+    loss = jax.jit(jax.value_and_grad(ppo_loss, has_aux=True), static_argnums=(2, 3))
     whole = loss(PARAMS, batch, NETS, CONFIG, jnp.float32(9.0))
     # Three minibatches of eight samples have 8, 1 and 0 valid samples; each expects 9 / 3 = 3.
     parts = [
@@ -166,13 +168,13 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error(
     size = 5
     config = replace(CONFIG, critic="state")
     nets = learners.nets(config, OBSERVATION, U, size)
-    params = nets.init(jax.random.key(0))
+    params = jax.jit(nets.init)(jax.random.key(0))
     state = np.random.default_rng(1).normal(size=(B, size)).astype(np.float32)
     minibatch = replace(_minibatch(), state=state)
     count = jnp.float32(14.0)
-    loss, metrics = ppo_loss(params, minibatch, nets, config, count)
+    loss, metrics = _loss(params, minibatch, nets, config, count)
     monkeypatch.setattr(gradients, "GUESS_COST", 0.0)
-    free, _ = ppo_loss(params, minibatch, nets, config, count)
+    free, _ = _loss(params, minibatch, nets, config, count)
     flat = traverse_util.flatten_dict(params["actor"], sep="/")
     layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}
     hidden = np.tanh(

@@ -212,7 +212,7 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
         bound_cost=0.0,
     )
     ppo = learners.ppo(config, Sizes(2 * history, 1), _UPDATES, "autodiff")
-    state = ppo.init(jax.random.key(3))
+    state = jax.jit(ppo.init)(jax.random.key(3))
 
     @jax.jit
     def train(state: Any) -> tuple[Any, jax.Array]:
@@ -248,7 +248,9 @@ def test_a_memory_that_is_no_number_spoils_nothing() -> None:
         begins=jnp.zeros(shape, bool),
     )
     ppo = learners.ppo(CONFIG, Sizes(WIDTH, 2), backend="autodiff")
-    after, metrics = ppo.update(ppo.init(jax.random.key(0)), batch, jax.random.key(1))
+    after, metrics = jax.jit(ppo.update)(
+        jax.jit(ppo.init)(jax.random.key(0)), batch, jax.random.key(1)
+    )
     assert float(metrics["skipped_steps"]) == 0.0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after.params))
 

@@ -69,7 +69,7 @@ def _ppo(config: AlgoConfig, backend: Backend = "sequences") -> PPO:
 
 
 def _learner(seed: int = 0) -> LearnerState:
-    return _ppo(CONFIG).init(jax.random.key(seed))
+    return jax.jit(_ppo(CONFIG).init)(jax.random.key(seed))
 
 
 @partial(jax.jit, static_argnums=(2, 3))
@@ -87,18 +87,19 @@ def _samples(batch: Batch) -> Minibatch:
 def test_gradients_of_minibatches_add_up_to_that_of_all_samples(minibatches: int) -> None:
     samples, params = _samples(_batch()), _learner().params
     count = jnp.sum(samples.valid)
-    rows = sequences.arrange(samples, STEPS)
-    dealt = sequences.deal(jax.random.key(3), rows.valid.any(axis=1), minibatches)
+    rows = jax.jit(sequences.arrange, static_argnums=1)(samples, STEPS)
+    deal = jax.jit(sequences.deal, static_argnums=2)
+    dealt = deal(jax.random.key(3), rows.valid.any(axis=1), minibatches)
     config = replace(CONFIG, num_minibatches=minibatches)
-    parts = [
-        sequences.gradient(params, rows, dealt.order, span, _ppo(config).learning, count)
-        for span in dealt.span
-    ]
+    learning = _ppo(config).learning
+    gradient = jax.jit(
+        lambda span: sequences.gradient(params, rows, dealt.order, span, learning, count)
+    )
+    parts = [gradient(span) for span in dealt.span]
     found = jax.tree.map(lambda *x: sum(x), *parts)
     whole = ppo._gather(samples, jnp.arange(GROUPS), CONFIG)
-    expected = jax.grad(gradients.ppo_loss, has_aux=True)(
-        params, whole, _ppo(CONFIG).learning.networks, CONFIG, count
-    )
+    loss = jax.grad(gradients.ppo_loss, has_aux=True)
+    expected = jax.jit(loss, static_argnums=(2, 3))(params, whole, learning.networks, CONFIG, count)
     # Sums of 80 float32 terms of order 1 to 100, added in another order.
     chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
 

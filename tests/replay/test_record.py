@@ -97,8 +97,9 @@ def test_progress_along_paths_is_that_of_training(steer):
     )
     level = cells.split(cells.load(judge.config).cells[0].levels)[2]
     level = jax.tree.map(jnp.asarray, level)
-    path = geodesic.begin(level, judge.config.robot.hull_radius)
-    end = geodesic.go_on(path, recording.pose[-1, :, :2], level, judge.config.robot.hull_radius)
+    radius = judge.config.robot.hull_radius
+    path = jax.jit(geodesic.begin, static_argnums=1)(level, radius)
+    end = jax.jit(geodesic.go_on, static_argnums=3)(path, recording.pose[-1, :, :2], level, radius)
     np.testing.assert_allclose(
         recording.reward["path_progress"].sum(axis=0)[recording.arrival == 0],
         2.0 * (path.distance - end.distance)[recording.arrival == 0],

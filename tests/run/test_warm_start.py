@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -61,7 +62,7 @@ def _load(words: list[str]) -> tuple[Kept, TrainState, TrainConfig]:
     source = warm_start.read(settings)
     assert source is not None
     program, schedule = programs.load(settings)
-    return source, mesh.init(program)(schedule), settings
+    return source, jax.jit(mesh.init(program))(schedule), settings
 
 
 def _rows(run: Path) -> list[dict]:

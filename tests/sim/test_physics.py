@@ -45,20 +45,13 @@ SIDE = 0.6  # m
 GRIP = 9.81  # m/s^2; friction 1
 
 
-# Some tests compile their own program. With wheeled robots by `jax` each such test takes half a
-# minute, so that engine runs these tests only with `-m slow`.
-ONCE_MORE = pytest.mark.parametrize(
-    "engine",
-    [
-        pytest.param(each, marks=[pytest.mark.slow] * (each == ("jax", "wheeled")))
-        for each in ENGINES
-    ],
-    indirect=True,
-    ids="-".join,
-)
+# Wheeled robots by `jax` take a quarter of a minute to compile, so they run with `-m slow` only.
+FASTER = [
+    pytest.param(each, marks=[pytest.mark.slow] * (each == ("jax", "wheeled"))) for each in ENGINES
+]
 
 
-@pytest.fixture(scope="module", params=ENGINES, ids="-".join)
+@pytest.fixture(scope="module", params=FASTER, ids="-".join)
 def engine(request: pytest.FixtureRequest) -> Iterator[Engine]:
     # A program that uses Warp calls back into the process that compiled it, so it must not be
     # cached on disk.
@@ -121,7 +114,6 @@ def _check_close(found: Path, expected: Path) -> None:
     assert place.max() <= 0.01
 
 
-@ONCE_MORE
 def test_random_commands_free_of_contact_as_in_c(engine: Engine) -> None:
     pose = _yaws(2, [(-1.0, 0.0), (0.0, 0.0), (1.0, 0.0)])
     wheels = _random_wheels(4, 200, 1)
@@ -132,7 +124,6 @@ def test_random_commands_free_of_contact_as_in_c(engine: Engine) -> None:
     _check_close(found, expected)
 
 
-@ONCE_MORE
 def test_contacts_as_in_c(engine: Engine) -> None:
     obstacle = np.array([[0.1, 0.02, 0.5, 0.06, 0.04], [-0.15, -0.12, 1.1, 0.05, 0.05]], np.float32)
     pose = _yaws(2, [(-0.03, -0.05), (0.05, 0.13), (0.0, -0.2)])
@@ -309,7 +300,6 @@ def _lagging(engine: Engine, robot: RobotConfig) -> tuple[Engine, Any]:
     return engine, changed
 
 
-@ONCE_MORE
 def test_a_lagging_servo_follows_the_closed_form(engine: Engine) -> None:
     robot = dataclasses.replace(engine.loaded.robot, motor_lag=LAG)
     slow, changed = _lagging(engine, robot)
@@ -328,7 +318,6 @@ def test_a_lagging_servo_follows_the_closed_form_in_c(body: str) -> None:
     _check_lag(Path(*(np.concatenate(p, axis=1) for p in zip(*paths, strict=True))), robot)
 
 
-@ONCE_MORE
 @pytest.mark.slow
 def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     # Ten turns on the spot at 3.14 rad/s take 10 * 2 pi / 3.14 = 20.01 s with the nominal track.
@@ -344,7 +333,6 @@ def test_the_track_decides_how_far_wheels_turn_a_robot(engine: Engine) -> None:
     np.testing.assert_allclose(turns, expected, rtol=1e-3)
 
 
-@ONCE_MORE
 @pytest.mark.slow
 def test_another_chassis_drives_as_one_compiled_so(engine: Engine) -> None:
     """Compares mass, friction, wheels and track set at run time with a model built with them."""

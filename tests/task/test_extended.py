@@ -26,6 +26,7 @@ from swarmjax.task.stage_config import BUILT_IN, StageConfig
 RING = StageConfig(name="ring", robots=3, side=1.0, level="ring")
 SIM = SimConfig(impl="jax", max_robots=4, max_obstacles=1)
 WEIGHT = -0.25
+_draw = jax.jit(extended.draw, static_argnums=(2, 3))
 
 
 def _world(source: str, stages: tuple[StageConfig, ...] = (RING,), **task: object) -> World:
@@ -42,11 +43,11 @@ def world() -> World:
 def drawn(world: World) -> level.Level:
     uniforms = np.random.default_rng(3).random(level.uniform_count(world.spacing), np.float32)
     stage = task_stage.single(RING, world.drawings)
-    return extended.draw(uniforms, stage, world.spacing, world.drawings)
+    return _draw(uniforms, stage, world.spacing, world.drawings)
 
 
 def _step(world: World, drawn: level.Level, action: np.ndarray) -> tuple:
-    state = env.reset(world, drawn)
+    state = jax.jit(env.reset, static_argnums=0)(world, drawn)
     begun = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
     return jax.jit(partial(env.step, world))(begun, action)
 
@@ -56,7 +57,7 @@ def test_an_observation_follows_the_built_in_ones(world: World, drawn: level.Lev
     assert (len(names), names[-1]) == (world.observation_size, "nearest_robot")
     place = np.array(drawn.start[:3, :2])
     apart = np.linalg.norm(place[:, None] - place[None], axis=-1) + 9.0 * np.eye(3)
-    seen = env.reset(world, drawn).observation[:3, -1]
+    seen = jax.jit(env.reset, static_argnums=0)(world, drawn).observation[:3, -1]
     np.testing.assert_allclose(seen, apart.min(axis=1), atol=1e-6)  # float32
 
 
@@ -79,7 +80,7 @@ def test_the_judge_draws_the_same_level(world: World) -> None:
     stage = task_stage.single(RING, world.drawings)
     theirs = judge.draw_level(stage, world.spacing, 5, 2, world.drawings)
     uniforms = np.random.default_rng([5, 2]).random(level.uniform_count(world.spacing), np.float32)
-    mine = extended.draw(uniforms, stage, world.spacing, world.drawings)
+    mine = _draw(uniforms, stage, world.spacing, world.drawings)
     for one, other in zip(theirs, mine, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)  # XLA's fusion changes the rounding
 

@@ -132,7 +132,7 @@ def test_nothing_is_drawn_and_numpy_and_jax_agree(layout: Layout) -> None:
         np.testing.assert_array_equal(mine, theirs)
     single = jax.tree.map(jnp.asarray, task_stage.select(task_stage.stack([stage]), 0))
     uniforms = jnp.full(level.uniform_count(SPACING), 0.3)
-    found = level.sample(uniforms, single, SPACING, jnp)
+    found = jax.jit(level.sample, static_argnums=(2, 3))(uniforms, single, SPACING, jnp)
     for mine, theirs in zip(found[:-1], expected[:-1], strict=True):
         # XLA may round float32 products differently: one ulp at 5 m, where robots are parked.
         np.testing.assert_allclose(mine, theirs, atol=5e-7)

@@ -84,10 +84,11 @@ def test_an_absent_obstacle_bars_no_path() -> None:
 def test_a_robot_without_a_path_keeps_its_distance() -> None:
     walls = [[0.0, 0.0, 0.0, 0.01, 0.6]]  # from wall to wall
     drawn = _level([-0.3, 0.0], [0.3, 0.0], walls)
-    path = geodesic.begin(drawn, HULL)
+    path = jax.jit(partial(geodesic.begin, hull_radius=HULL))(drawn)
     assert float(path.distance[0]) == pytest.approx(0.6, abs=ROUND)
     drawn = jax.tree.map(jnp.asarray, drawn)
-    later = geodesic.go_on(path, jnp.array([[-0.1, 0.2]]), drawn, HULL)
+    go_on = jax.jit(partial(geodesic.go_on, hull_radius=HULL))
+    later = go_on(path, jnp.array([[-0.1, 0.2]]), drawn)
     assert float(later.distance[0]) == pytest.approx(0.6, abs=ROUND)
 
 
@@ -152,8 +153,11 @@ def test_the_waypoint_is_no_corner_of_an_absent_obstacle() -> None:
 
 def _waypoint(drawn: Level) -> np.ndarray:
     drawn = jax.tree.map(jnp.asarray, drawn)
-    path = geodesic.begin(drawn, HULL)
-    return np.asarray(geodesic.waypoint(path, drawn.start[:, :2], drawn))[0]
+
+    def find(drawn: Level) -> jax.Array:
+        return geodesic.waypoint(geodesic.begin(drawn, HULL), drawn.start[:, :2], drawn)
+
+    return np.asarray(jax.jit(find)(drawn))[0]
 
 
 @pytest.mark.slow
@@ -216,16 +220,20 @@ def test_an_arena_keeps_the_path_from_where_its_robot_is(driven: Driven) -> None
 
 
 @pytest.mark.slow
+def _look(world: env.World, state: env.EnvState) -> np.ndarray:
+    return np.asarray(jax.jit(partial(env.look_around, world))(state))
+
+
 def test_a_critic_of_the_state_sees_how_long_the_path_is(driven: Driven) -> None:
     assert driven.ended.path is not None
-    seen = env.look_around(driven.world, driven.ended)
+    seen = _look(driven.world, driven.ended)
     straight, path = driven.ended.distance[0], driven.ended.path.distance[0]
     assert path > straight + 0.05  # m; the wall is in the way
     assert seen[0, 3] == path
 
 
 def test_a_critic_of_the_state_sees_where_the_path_leads(driven: Driven) -> None:
-    seen = env.look_around(driven.world, driven.ended)
+    seen = _look(driven.world, driven.ended)
     pose = physics.poses(driven.world.physics, driven.ended.sim)[0]
     corner = np.array([-0.01 - CORNER, 0.2 + CORNER])  # at the near end of the wall
     bearing = np.arctan2(*(corner - pose[:2])[::-1]) - pose[2]
@@ -234,12 +242,12 @@ def test_a_critic_of_the_state_sees_where_the_path_leads(driven: Driven) -> None
 
 
 def test_without_paths_it_sees_the_straight_distance(driven: Driven) -> None:
-    seen = env.look_around(driven.world, dataclasses.replace(driven.ended, path=None))
+    seen = _look(driven.world, dataclasses.replace(driven.ended, path=None))
     assert seen[0, 3] == driven.ended.distance[0]
 
 
 def test_without_paths_it_sees_the_direction_of_the_target(driven: Driven) -> None:
-    seen = env.look_around(driven.world, dataclasses.replace(driven.ended, path=None))[0]
+    seen = _look(driven.world, dataclasses.replace(driven.ended, path=None))[0]
     np.testing.assert_allclose(seen[4:6], seen[:2] / np.hypot(*seen[:2]), atol=ROUND)
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -30,12 +31,14 @@ def _listen(
     **realism: Any,
 ) -> np.ndarray:
     """Returns what each robot hears within 0.7 m, [R, K, W]."""
-    config = NeighboursConfig(count=count)
-    obstacle, pose = xp.asarray(obstacle, xp.float32), xp.asarray(pose)
-    hidden = hearing.hidden(pose, obstacle, xp)
-    heard = hearing.reachable(pose, xp.asarray(present), hidden, config, xp)
-    drawn = None if seed is None else xp.asarray(seed, xp.uint32)
-    found = hearing.listen(heard, config, RealismConfig(**realism), drawn, xp.asarray(3), xp)
+    config, drawn = NeighboursConfig(count=count), None if seed is None else np.uint32(seed)
+
+    def listen(pose: Any, obstacle: Any, present: Any, drawn: Any) -> Any:
+        heard = hearing.reachable(pose, present, hearing.hidden(pose, obstacle, xp), config, xp)
+        return hearing.listen(heard, config, RealismConfig(**realism), drawn, xp.asarray(3), xp)
+
+    compiled = jax.jit(listen) if xp is jnp else listen
+    found = compiled(np.asarray(pose), np.asarray(obstacle, np.float32), present, drawn)
     return np.asarray(found).reshape(len(pose), count, -1)
 
 

@@ -57,7 +57,8 @@ def play(tiny_world: World) -> Play:
 
     def play(rule: Arrival = "hold", limit: int = 100, chosen: np.ndarray | None = None) -> Episode:
         world, step, traces = compiled(rule, limit)
-        state = env.reset(world, jax.tree.map(jnp.asarray, holding.level(ROBOTS, OBSTACLES)))
+        level = jax.tree.map(jnp.asarray, holding.level(ROBOTS, OBSTACLES))
+        state = jax.jit(env.reset, static_argnums=0)(world, level)
         state = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
         states, steps = [state], []
         for action in holding.actions(ROBOTS) if chosen is None else chosen:

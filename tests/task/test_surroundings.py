@@ -53,7 +53,7 @@ def test_a_target_is_seen_in_the_robots_frame() -> None:
 def test_the_distance_to_go_is_shown_up_to_4_metres(to_go: float, shown: float) -> None:
     level, pose = _level(1, np.zeros((0, 5))), np.zeros((1, 3), np.float32)
     given = pose, level, np.zeros(1, bool), np.float32([to_go]), level.target
-    found = surroundings.look(*given)
+    found = jax.jit(surroundings.look)(*given)
     np.testing.assert_allclose(found[0, 3], shown, atol=ROUND)
 
 
@@ -65,7 +65,8 @@ def test_the_direction_to_the_waypoint_is_a_unit_vector_unless_it_is_within_1_mm
     level, pose = _level(1, np.zeros((0, 5))), np.float32([[0.0, 0.0, np.pi / 2]])
     given = pose, level, np.zeros(1, bool), np.float32([TO_GO]), np.float32([[away, 0.0]])
     # The robot faces north and the waypoint is in the east: to the right.
-    np.testing.assert_allclose(surroundings.look(*given)[0, 4:6], [0.0, -shown], atol=ROUND)
+    found = jax.jit(surroundings.look)(*given)
+    np.testing.assert_allclose(found[0, 4:6], [0.0, -shown], atol=ROUND)
 
 
 def test_another_robot_is_seen_with_its_heading_and_its_target() -> None:

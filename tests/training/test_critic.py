@@ -54,7 +54,8 @@ def trained(tiny_config: TrainConfig) -> Trained:
     program, schedule = programs.load(config)
     last = jax.jit(partial(loop.init, program))(schedule)
     last = replace(last, learners=learners.moved(last.learners))
-    waiting = loop._draw(program, schedule, last.curriculum, jax.random.key(1), waiting=1)
+    draw = jax.jit(partial(loop._draw, program, schedule, waiting=1))
+    waiting = draw(last.curriculum, jax.random.key(1))
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     collect = jax.jit(partial(rollout.collect, program))
@@ -65,7 +66,7 @@ def trained(tiny_config: TrainConfig) -> Trained:
 
 def _look(trained: Trained, arenas: EnvState) -> np.ndarray:
     """Returns the surroundings of each robot in the layout of the learners, [L, A, N, P]."""
-    around = jax.vmap(partial(env.look_around, trained.program.world))(arenas)
+    around = jax.jit(jax.vmap(partial(env.look_around, trained.program.world)))(arenas)
     return np.asarray(rollout.to_learners(around, trained.program.config.learners))
 
 
@@ -90,7 +91,7 @@ def _stepped(trained: Trained) -> Arena:
     unpack = jax.vmap(partial(physics.unpack, world.physics))
     arenas = replace(trained.before, sim=unpack(trained.before.sim))
     action = rollout.to_arenas(trained.trajectory.action[0])
-    return jax.vmap(partial(env.step, world))(arenas, action)[0]
+    return jax.jit(jax.vmap(partial(env.step, world)))(arenas, action)[0]
 
 
 def test_the_critic_is_shown_what_is_around_each_robot(trained: Trained) -> None:
@@ -188,7 +189,7 @@ def _batch(learner: LearnerState, seed: int) -> Batch:
     observation = jax.random.normal(keys[0], (*shape, SIZE))
     noise = jax.random.normal(keys[1], (*shape, 2))
     state = jax.random.normal(keys[2], (*shape, STATE))
-    action, log_prob, _ = _ppo().act(learner, observation, noise)
+    action, log_prob, _ = jax.jit(_ppo().act)(learner, observation, noise)
     return Batch(
         observation=observation,
         action=action,
@@ -202,7 +203,7 @@ def _batch(learner: LearnerState, seed: int) -> Batch:
 
 def _learn(told: bool) -> float:
     """Trains a critic with the state, or with zeros in its place; returns the last value loss."""
-    learner, update = _ppo().init(jax.random.key(0)), jax.jit(_ppo().update)
+    learner, update = jax.jit(_ppo().init)(jax.random.key(0)), jax.jit(_ppo().update)
     loss = np.inf
     for step in range(100):
         batch = _batch(learner, step)
@@ -227,35 +228,36 @@ def test_a_state_changes_nothing_of_the_policy_but_by_its_guess(
     # No clipping here: it scales both networks by one norm, so the critic would change the actor.
     config = replace(CONFIG, num_minibatches=1, max_grad_norm=None)
     made = _ppo(config, backend)
-    learner = made.init(jax.random.key(0))
+    learner = jax.jit(made.init)(jax.random.key(0))
     batch = replace(_batch(learner, 0), advantage=_batch(learner, 1).return_)
     other = replace(batch, state=jnp.zeros((8, 32, STATE)))
-    one, two = (made.update(learner, each, jax.random.key(0))[0].params for each in (batch, other))
+    update = jax.jit(made.update)
+    one, two = (update(learner, each, jax.random.key(0))[0].params for each in (batch, other))
     jax.tree.map(np.testing.assert_array_equal, one["actor"], two["actor"])
     kernels = [each["critic"]["torso"]["hidden_0"]["kernel"] for each in (one, two)]
     assert np.abs(kernels[0] - kernels[1]).max() > 0.0
 
 
 def test_a_state_that_is_not_finite_is_left_out() -> None:
-    learner = _ppo().init(jax.random.key(0))
+    learner = jax.jit(_ppo().init)(jax.random.key(0))
     batch = _batch(learner, 0)
     assert batch.state is not None
     spoilt = replace(batch, state=batch.state.at[0, 0, 0].set(jnp.nan))
     without = replace(batch, valid=batch.valid.at[0, 0].set(False))
     found, expected = (
-        _ppo().update(learner, each, jax.random.key(0))[0] for each in (spoilt, without)
+        jax.jit(_ppo().update)(learner, each, jax.random.key(0))[0] for each in (spoilt, without)
     )
     jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_what_is_not_valid_may_hold_nan() -> None:
-    learner = _ppo().init(jax.random.key(0))
+    learner = jax.jit(_ppo().init)(jax.random.key(0))
     batch = _batch(learner, 0)
     assert batch.state is not None
     valid = batch.valid.at[:, ::2].set(False)
     holes = jnp.where(valid[..., None], batch.state, jnp.nan)
     found, expected = (
-        _ppo().update(learner, replace(batch, valid=valid, state=x), jax.random.key(0))[0]
+        jax.jit(_ppo().update)(learner, replace(batch, valid=valid, state=x), jax.random.key(0))[0]
         for x in (holes, batch.state)
     )
     jax.tree.map(np.testing.assert_array_equal, found, expected)

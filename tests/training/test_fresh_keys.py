@@ -115,7 +115,7 @@ def test_every_epoch_shuffles_in_an_order_of_its_own() -> None:
     epochs, groups = 12, 4
     config = AlgoConfig(hidden_sizes=(4,), epochs=epochs, num_minibatches=2)
     ppo = learners.ppo(config, Sizes(3, 2), 1, "autodiff")
-    learner = ppo.init(jax.random.key(0))
+    learner = jax.jit(ppo.init)(jax.random.key(0))
     zeros = jnp.zeros((groups, 1))
     batch = Batch(
         observation=jnp.zeros((groups, 1, 3)),

@@ -46,7 +46,7 @@ def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
     one = np.array([there[0], scene.target[1], there[2]])
     levels = [scene._replace(target=target) for target in (there, one, one)]
     stacked = jax.tree.map(lambda *fields: jnp.asarray(np.stack(fields)), *levels)
-    begun = jax.vmap(functools.partial(env.reset, program.world))(stacked)
+    begun = jax.jit(jax.vmap(functools.partial(env.reset, program.world)))(stacked)
     none = jnp.zeros(3, jnp.int32)
     starts = Arena(**vars(begun), stage=none, cohort=none)
     before = dataclasses.replace(starts, clock=jnp.array([0, 15, 0], jnp.int32))

@@ -50,12 +50,13 @@ def trained(request: pytest.FixtureRequest, tiny_config: TrainConfig) -> Trained
     program, schedule = programs.load(config)
     last = jax.jit(partial(loop.init, program))(schedule)
     last = replace(last, learners=learners.moved(last.learners))
-    waiting = loop._draw(program, schedule, last.curriculum, jax.random.key(1), waiting=1)
+    draw = jax.jit(partial(loop._draw, program, schedule, waiting=1))
+    waiting = draw(last.curriculum, jax.random.key(1))
     collect = jax.jit(partial(rollout.collect, program))
     # The arenas are in the middle of their episodes, which end at 16 steps.
     before = replace(last.arenas, clock=jnp.array([0, 0, 9, 10, 11, 12, 13, 0], jnp.int32))
     arenas, trajectory, ended = collect(last.learners, before, waiting, jax.random.key(2))
-    batch = rollout.batch(program, trajectory, before.recall, ended)
+    batch = jax.jit(partial(rollout.batch, program))(trajectory, before.recall, ended)
     over = np.asarray(ended.episodes) > 0
     return Trained(program, schedule, last, arenas, trajectory, over, batch)
 
@@ -72,7 +73,8 @@ def test_what_is_recomputed_through_time_is_what_the_rollout_saw(trained: Traine
     rows = jnp.array([3, 0, 7, 1, 2, 6, 5, 4])
     minibatch = ppo._gather(samples, rows, config)
     nets = trained.program.ppo.learning.networks
-    (mean, std, *_), value = gradients.evaluate(_one(learners).params, nets, minibatch)
+    evaluate = jax.jit(gradients.evaluate, static_argnums=1)
+    (mean, std, *_), value = evaluate(_one(learners).params, nets, minibatch)
     log_prob = gradients.log_density(mean, std, minibatch.action)
     valid = np.asarray(minibatch.valid)
     assert valid.sum() > 50

@@ -43,18 +43,18 @@ def _batch(share: float, seed: int = 0) -> Minibatch:
 
 
 def _params() -> networks.Params:
-    return PPO_.learning.networks.init(jax.random.key(0))
+    return jax.jit(PPO_.learning.networks.init)(jax.random.key(0))
 
 
 @pytest.mark.parametrize(("share", "used"), [(1.0, 3), (0.5, 2), (0.1, 1), (0.0, 0)])
 def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) -> None:
     samples, params = _batch(share), _params()
-    arranged = blocks.arrange(samples)
+    arranged = jax.jit(blocks.arrange)(samples)
     assert int(arranged.used) == used  # 750, about 375, about 75 and 0 samples, in blocks of 256
     count = jnp.sum(samples.valid)
-    found = blocks.gradient(params, arranged, PPO_.learning, count)
+    found = jax.jit(blocks.gradient, static_argnums=2)(params, arranged, PPO_.learning, count)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-    whole = jax.grad(gradients.ppo_loss, has_aux=True)
+    whole = jax.jit(jax.grad(gradients.ppo_loss, has_aux=True), static_argnums=(2, 3))
     # float32 rounding: the two gradients add the samples in different orders.
     for mine, theirs in zip(
         jax.tree.leaves(found),

@@ -290,7 +290,7 @@ def test_a_learner_that_takes_all_at_once_learns_as_by_autodiff(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = replace(SMALL, num_minibatches=1, epochs=3)
-    begun = _ppo(config).init(jax.random.key(0))
+    begun = jax.jit(_ppo(config).init)(jax.random.key(0))
     batch = _batch(_minibatch(begun.params, config, 8 * 20), 8)
     expected = _learn(config, begun, batch, "autodiff")
     calls = _interpret(monkeypatch)
@@ -303,7 +303,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = replace(SMALL, num_minibatches=4, epochs=2)
-    begun = _ppo(config).init(jax.random.key(0))
+    begun = jax.jit(_ppo(config).init)(jax.random.key(0))
     drawn = _minibatch(begun.params, config, 32 * 40)
     _interpret(monkeypatch)
     found = _learn(config, begun, _batch(drawn, 32))
@@ -335,7 +335,7 @@ def test_a_learner_steps_through_the_tiles_that_it_has_shuffled(
 @pytest.mark.slow
 def test_minibatches_without_a_valid_sample_are_no_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(SMALL, num_minibatches=4, epochs=3)
-    begun = _ppo(config).init(jax.random.key(0))
+    begun = jax.jit(_ppo(config).init)(jax.random.key(0))
     drawn = _minibatch(begun.params, config, 8 * 40)
     _interpret(monkeypatch)
     few = replace(drawn, valid=drawn.valid & (np.arange(8 * 40) < 80))  # one tile of 64
@@ -354,7 +354,7 @@ def test_learners_side_by_side_learn_as_each_does_alone(monkeypatch: pytest.Monk
     _interpret(monkeypatch)
     begun, batches = [], []
     for seed, share in enumerate((1.0, 0.4, 0.0)):
-        begun.append(_ppo(config).init(jax.random.key(seed)))
+        begun.append(jax.jit(_ppo(config).init)(jax.random.key(seed)))
         drawn = _minibatch(begun[-1].params, config, 8 * 20, seed)
         batches.append(_batch(replace(drawn, valid=np.arange(8 * 20) < share * 8 * 20), 8))
 
