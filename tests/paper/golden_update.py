@@ -1,6 +1,7 @@
 """Runs our update on the golden batch and measures its errors against the golden numbers.
 
-As a program, `golden_update.py CASE` prints the errors as JSON. With JAX_ENABLE_X64=1, all numbers are float64.
+As a program, `golden_update.py CASE` prints the errors as JSON. With JAX_ENABLE_X64=1, all numbers
+are float64.
 """
 
 import functools
