@@ -124,7 +124,7 @@ _SOUND: dict[str, list[str]] = {
 }
 # Words that are appended to give a process very little work; the last word for a key counts.
 _TINY: dict[str, list[str]] = {
-    "train": ["run.dry=true", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
+    "train": ["run.stop_after=1", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
     "replay": ["steps=2", "episodes=1", "workers=1"],
     "suite": ["write=false"],

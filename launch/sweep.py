@@ -48,7 +48,7 @@ from swarmjax.run.settings import TrainConfig
 GRID = "grid."
 MOST_CELLS = 256
 # Keys that the sweep sets for each cell.
-_OWN = ("resume", "run.dir", "run.distributed", "run.dry")
+_OWN = ("resume", "run.dir", "run.distributed")
 _TICK_S = 1.0
 _SAVE_S = 180  # from the signal of Slurm to the end of a job
 

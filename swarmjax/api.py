@@ -158,8 +158,6 @@ def train_policy(
     else:
         more = {} if extensions is None else {"extensions": extensions}
         config = load_run(*_given({**_mapping(settings), **more}))
-    if config.run.dry:
-        raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
     stop = Stop()
     run = Run(config, stop=stop, loggers=_loggers(log), on_update=on_update)
     # Only the main thread can handle signals.

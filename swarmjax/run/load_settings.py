@@ -173,8 +173,14 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
             )
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
-    run = kept["run"] | {"stop_after": None, "distributed": False} | given.get("run", {})
-    run["dir"] = given.get("run", {}).get("dir") or given.get("resume")
+    typed = given.get("run", {})
+    here = given.get("resume") or typed.get("dir")
+    if typed.get("dir") and Path(typed["dir"]) != Path(here):
+        raise ConfigError(
+            f"run.dir is {show(typed['dir'])}, but resume is {show(here)}, and a run goes on in "
+            "its own directory: leave run.dir out."
+        )
+    run = kept["run"] | {"stop_after": None, "distributed": False} | typed | {"dir": here}
     spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
     return settle(build(TrainConfig, kept | spread | given | {"run": run}))
 

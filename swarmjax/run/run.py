@@ -19,7 +19,6 @@ from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.run import (
     checkpoint,
-    compile_cache,
     directory,
     hosts,
     memory,
@@ -114,13 +113,10 @@ class Run:
           StoppedError: if a stop was requested before there was anything to save.
         """
         hosts.join(self.settings)
-        refusal = memory.refusal(self.settings)
-        with compile_cache.use(), hosts.lost_peers(), refusal, self._directory():
+        with hosts.lost_peers(), memory.refusal(self.settings), self._directory():
             self.load()
             if self.update < self.settings.updates:
                 self.compile()
-            if self.settings.run.dry:
-                return
             if not self._is_finished():
                 self._open_files()
                 self._train_chunks()
@@ -132,9 +128,6 @@ class Run:
     def _directory(self) -> Iterator[None]:
         """Makes or opens the run directory, and keeps other processes out of it."""
         weights_and_biases.check(self.settings)
-        if self.settings.run.dry:
-            yield
-            return
         chosen = self._choose_path() if hosts.is_first() else Path()
         claimed = self.settings.run.dir is None
         with hosts.own_directory(chosen) as self.path, directory.locked(self.path, claimed=claimed):
@@ -177,8 +170,8 @@ class Run:
             self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
             init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
             shapes = init.eval_shape(self.schedule)
-            memory.check_state(settings, mesh.bytes_each(settings, shapes), memory.limit())
-            self.state = shapes if settings.run.dry else self._first_state(init, shapes, source)
+            memory.check(settings, mesh.bytes_each(settings, shapes))
+            self.state = self._first_state(init, shapes, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
 
@@ -213,15 +206,13 @@ class Run:
         with self._display.working("compiling"):
             self._stop.check()
             compiled = compile_chunk(self.program, self.schedule, self.state)
-            memory.check(self.settings, compiled.total_bytes, memory.limit())
+            memory.check(self.settings, compiled.memory_bytes)
             began = time.perf_counter()
-            if not self.settings.run.dry:
-                self._claim(compiled)
+            self._claim(compiled)
             seconds = compiled.seconds + time.perf_counter() - began
             self.compiled = replace(compiled, seconds=seconds)
             self._stop.check()
-        for sentence in sentences.compiled(self.compiled, dry=self.settings.run.dry):
-            self._display.say(sentence)
+        self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
 
     def _claim(self, compiled: Compiled) -> None:
         """Builds Warp's kernels, and allocates the program's memory."""
@@ -237,13 +228,10 @@ class Run:
         return spent and bool(hosts.share(results.is_current(self.path, self.update))[0])
 
     def _open_files(self) -> None:
-        """Writes `config.json`, and brings the logs of a run that is resumed from elsewhere."""
+        """Writes `config.json`."""
         stored = to_dict(replace(self.settings, resume=None))
         if self.settings.resume is not None:
-            source = Path(self.settings.resume)
-            stored = directory.kept_config(read_config(source), stored)
-            if self._kept is not None:
-                directory.bring(source, self.path, self._kept.logs)
+            stored = directory.kept_config(read_config(Path(self.settings.resume)), stored)
         try:
             directory.write_json(self.path / directory.CONFIG, stored)
         except OSError as error:
@@ -261,7 +249,7 @@ class Run:
             Recorder(
                 self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
             ) as record,
-            Checkpoints(self.path, options.keep_checkpoints, resumed) as checkpoints,
+            Checkpoints(self.path, resumed) as checkpoints,
         ):
             self._save(checkpoints, record)
             for n in self._chunks():
@@ -371,8 +359,7 @@ class Run:
 
     def _save(self, checkpoints: Checkpoints, record: Recorder) -> None:
         """Begins to write a checkpoint, unless this update is saved already."""
-        about = {"budget": self.settings.budget, "streams": self.settings.stream_count}
-        checkpoints.save(self.state, self.update, record.sync(), of=about)
+        checkpoints.save(self.state, self.update, record.sync())
         self._saved = (time.monotonic(), self.update)
 
     def _write_results(self) -> None:
@@ -390,8 +377,8 @@ class Run:
 
 
 def check_free(run: Path, settings: TrainConfig) -> None:
-    """Refuses a directory that is not empty, unless it holds the run that is resumed."""
-    if settings.resume is not None and Path(settings.resume).resolve() == run.resolve():
+    """Refuses a directory that is not empty, unless a run is resumed there."""
+    if settings.resume is not None:
         return
     held = directory.visible(run)
     if directory.CONFIG in held:

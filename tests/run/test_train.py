@@ -190,15 +190,6 @@ def test_a_summary_of_a_smaller_budget_is_written_anew(
     assert json.loads((copied / "summary.json").read_text())["updates"] == 9
 
 
-def test_a_run_that_is_done_can_be_written_elsewhere(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _forbid_compiling(monkeypatch)
-    assert train.main([f"resume={whole}", f"run.dir={tmp_path}"]) == 0
-    assert _digest(tmp_path) == _digest(whole)
-    assert {"config.json", "policy.npz", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
-
-
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Returns a run of seeds 3 and 4 on two stages; the first stage ends by its budget."""
@@ -352,7 +343,7 @@ def test_a_resumed_run_spares_other_runs_and_what_is_spent(
     capsys.readouterr()
     before = (other / "config.json").read_bytes()
     sentence = _refusal(capsys, "train", f"resume={whole}", f"run.dir={other}")
-    assert "holds a run already" in sentence
+    assert "a run goes on in its own directory: leave run.dir out" in sentence
     assert (other / "config.json").read_bytes() == before
     sentence = _refusal(capsys, "train", f"resume={whole}", f"budget={4 * 4 * 5}")
     assert f"has spent {4 * 4 * 9} already" in sentence
@@ -418,15 +409,6 @@ def test_bad_input_is_one_sentence(
     sentence = _refusal(capsys, "train", *small, *words)
     for part in parts:
         assert part in sentence
-
-
-def test_a_dry_run_compiles_and_leaves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    assert _train(f"run.dir={run}", "run.dry=true") == 0
-    assert "MiB of state" in capsys.readouterr().out
-    assert not run.exists()
 
 
 @pytest.mark.slow
