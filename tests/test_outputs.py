@@ -51,7 +51,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     policies.saved(Path("policy.npz"))
     Path("mine.yaml").write_text(SUITE)
-    suite.main(["suite=mine.yaml", "write=true"])
     write(Path("run"), [row(0)])
     return tmp_path
 
