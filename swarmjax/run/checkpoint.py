@@ -336,28 +336,5 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
     return jax.tree_util.tree_map_with_path(fill, template)
 
 
-def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
-    """Extracts one seed from a run's checkpoint.
-
-    Args:
-      leaves: [N, ...] arrays of a run.
-      lane: index of the seed, 0..N-1.
-      seeds: N, the number of seeds in the config.
-
-    Returns:
-      The leaves of that seed, without the leading axis.
-
-    Raises:
-      CheckpointError: if the checkpoint has another number of seeds.
-    """
-    found = leaves["update"].shape
-    if found != (seeds,):
-        raise CheckpointError(
-            f"the checkpoint holds {found[0] if found else 'no axis of'} seeds, but the config "
-            f"says {seeds}: it belongs to another run."
-        )
-    return {name: leaf[lane] for name, leaf in leaves.items()}
-
-
 def _name(path: tuple) -> str:
     return jax.tree_util.keystr(path, simple=True, separator="/")

@@ -187,12 +187,13 @@ def _check_alike(settings: TrainConfig) -> None:
     theirs = json.loads(share_text(json.dumps(own)))
     if not share(own != theirs).any():
         return
+    differing = [
+        f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0"
+        for key in own
+        if own[key] != theirs.get(key)
+    ]
     other = "another process has other settings or versions"  # than this one, which is process 0
-    for key in own:
-        if own[key] != theirs.get(key):
-            other = f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0"
-            break
-    raise ConfigError(f"{other}: give all processes the same.")
+    raise ConfigError(f"{differing[0] if differing else other}: give all processes the same.")
 
 
 def _check_devices(settings: TrainConfig) -> None:

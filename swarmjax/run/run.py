@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from swarmjax import words
 from swarmjax.config import ConfigError, reading, to_dict
@@ -47,7 +46,7 @@ from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.rollout import Program
 
-CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
+CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's interval
 # There is a checkpoint at least after this share of the budget, so that a short run has some too.
 BUDGET_SHARE = 0.1
 GROWTH = 4  # a call is at most this many times as long as the previous one
@@ -92,7 +91,7 @@ class Run:
         """
         self.settings = settings
         self._stop = stop or Stop()
-        self._display = display or Display(Console(quiet=True))
+        self._display = display or Display(quiet=True)
         self._loggers, self._on_update = loggers, on_update or (lambda row: None)
         self.path, self.update = Path(), 0
         self._kept: Kept | None = None
@@ -166,12 +165,12 @@ class Run:
         self._stop.check()
         settings, self._kept = self.settings, self._read_checkpoint()
         source = warm_start.read(settings) if self._kept is None else None
-        with self._display.working("building the arenas"):
-            self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
-            init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
-            shapes = init.eval_shape(self.schedule)
-            memory.check(settings, mesh.bytes_each(settings, shapes))
-            self.state = self._first_state(init, shapes, source)
+        self._display.say("building the arenas ...")
+        self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
+        init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
+        shapes = init.eval_shape(self.schedule)
+        memory.check(settings, mesh.bytes_each(settings, shapes))
+        self.state = self._first_state(init, shapes, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
 
@@ -203,15 +202,15 @@ class Run:
 
     def compile(self) -> None:
         """Compiles the program and claims its memory, so that training cannot run out later."""
-        with self._display.working("compiling"):
-            self._stop.check()
-            compiled = compile_chunk(self.program, self.schedule, self.state)
-            memory.check(self.settings, compiled.memory_bytes)
-            began = time.perf_counter()
-            self._claim(compiled)
-            seconds = compiled.seconds + time.perf_counter() - began
-            self.compiled = replace(compiled, seconds=seconds)
-            self._stop.check()
+        self._display.say("compiling ...")
+        self._stop.check()
+        compiled = compile_chunk(self.program, self.schedule, self.state)
+        memory.check(self.settings, compiled.memory_bytes)
+        began = time.perf_counter()
+        self._claim(compiled)
+        seconds = compiled.seconds + time.perf_counter() - began
+        self.compiled = replace(compiled, seconds=seconds)
+        self._stop.check()
         self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
 
     def _claim(self, compiled: Compiled) -> None:
@@ -245,7 +244,6 @@ class Run:
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (
-            self._display,  # leaves the last table on screen, before the last sentences
             Recorder(
                 self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
             ) as record,

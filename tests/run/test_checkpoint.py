@@ -98,18 +98,6 @@ def test_another_run_is_refused_with_both_shapes() -> None:
         checkpoint.from_leaves(leaves, jax.eval_shape(lambda: _state(0.0)))
 
 
-@pytest.mark.slow
-def test_a_seed_is_taken_out_of_a_run() -> None:
-    leaves = {"update": np.array([4, 4]), "weights": np.arange(6.0).reshape(2, 3)}
-    mine = checkpoint.of_seed(leaves, 1, seeds=2)
-    assert mine["update"].shape == ()
-    np.testing.assert_array_equal(mine["weights"], [3.0, 4.0, 5.0])
-    with pytest.raises(CheckpointError, match="holds 2 seeds, but the config says 3"):
-        checkpoint.of_seed(leaves, 1, seeds=3)
-    with pytest.raises(CheckpointError, match="holds no axis of seeds, but the config says 1"):
-        checkpoint.of_seed({"update": np.int32(4)}, 0, seeds=1)
-
-
 @pytest.mark.parametrize("sound", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.slow
 def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
