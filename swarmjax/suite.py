@@ -21,14 +21,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from swarmjax import command, outputs
+from swarmjax import command
 from swarmjax.config import ConfigError, about, files, reading, setting
 from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trials
 from swarmjax.evaluate.cells import Cell, Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.table import PLAIN_WIDTH
-from swarmjax.outputs import OVERWRITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +38,6 @@ class SuiteConfig(Section):
 
     suite: str = field(metadata=about("a name in configs/suites/, or a .yaml file"))
     out: str | None = setting(None, ".npz file for all of its levels")
-    overwrite: bool = field(default=False, metadata=OVERWRITE)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -47,12 +45,9 @@ def main(arguments: Sequence[str]) -> int:
     settings = files.load(SuiteConfig, arguments)
     if settings.out is not None and Path(settings.out).suffix != ".npz":
         raise ConfigError(f"out is {reading.called(settings.out)}: give a file .npz.")
-    out = [] if settings.out is None else [Path(settings.out)]
-    outputs.check("out", out, overwrite=settings.overwrite)
     suite = cells.draw(settings.suite)
-    for path in out:
-        cells.write(path, suite)
-    outputs.note(out)
+    if settings.out is not None:
+        cells.write(Path(settings.out), suite)
     console = Console()
     if not console.is_terminal:
         console.width = PLAIN_WIDTH + 64  # a digest has 64 letters
