@@ -126,11 +126,7 @@ def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], 
 
 
 def observation(
-    size: int = 1,
-    unit: str = "1",
-    offset: float = 0.0,
-    scale: float = 1.0,
-    name: str | None = None,
+    size: int = 1, unit: str = "1", offset: float = 0.0, scale: float = 1.0, name: str | None = None
 ) -> Callable[[Callable], Observation]:
     """Turns a function into an observation.
 

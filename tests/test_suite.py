@@ -55,25 +55,9 @@ def test_digests_are_shown_and_held_to(
     assert "cell two of suite tiny has the digest " in capsys.readouterr().err
 
 
-def test_step_limits_are_listed(
+def test_a_friction_of_hulls_is_refused_as_that_of_a_robot(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file.write_text(f"{TEXT}    steps: 2345\n")
-    assert _command(monkeypatch, f"suite={file}") == 0
-    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
-    # A side, such as 0.6 m, is two words in the printed row.
-    column = head.index("steps") + 1
-    assert [row[column] for row in rows] == ["-", "2345"]
-
-
-def test_a_friction_of_hulls_is_listed_and_refused_as_that_of_a_robot(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file.write_text(f"{TEXT}    hull_friction: 0.7\n")
-    assert _command(monkeypatch, f"suite={file}") == 0
-    head, *rows = (line.split() for line in capsys.readouterr().out.splitlines())
-    column = head.index("friction") + 1
-    assert [row[column] for row in rows] == ["-", "0.7"]
     file.write_text(f"{TEXT}    hull_friction: 0.01\n")
     assert _command(monkeypatch, f"suite={file}") == 2
     assert "hull_friction is 0.01" in capsys.readouterr().err

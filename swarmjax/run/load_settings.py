@@ -22,14 +22,8 @@ _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "exte
 
 # The algo keys that a run with init_from shares with the run that it starts from.
 NETWORK_KEYS = (
-    "policy",
-    "network",
-    "hidden_sizes",
-    "memory",
-    "memory_size",
-    "critic",
-    "activation",
-    "mean_activation",
+    *("policy", "network", "hidden_sizes", "memory", "memory_size"),
+    *("critic", "activation", "mean_activation"),
 )
 
 

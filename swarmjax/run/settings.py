@@ -44,19 +44,8 @@ class TrainConfig(ProgramConfig):
     # What is trained. Which code runs, where it is written, what it starts from and who is called
     # is decided by whoever starts the run.
     shared: ClassVar[tuple[str, ...]] = (
-        "stage",
-        "robot",
-        "task",
-        "realism",
-        "algo",
-        "curriculum",
-        "sim",
-        "arenas",
-        "budget",
-        "levels_per_rollout",
-        "seed",
-        "seeds",
-        "streams",
+        *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
+        *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),
     )
 
     # `recipes.expand` replaces this word by the recipe's words, so no config holds it.
