@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError
-from swarmjax.outputs import replacing
+from swarmjax.outputs import replacing, unwritable
 from swarmjax.run.errors import CheckpointError
 
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
@@ -56,7 +56,7 @@ def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
             run.mkdir(parents=True, exist_ok=True)
             _lock(run, held)
         except OSError as error:
-            raise unwritable(run, error) from None
+            raise unwritable("run.dir", run, error) from None
         try:
             yield
         finally:
@@ -141,12 +141,6 @@ def is_written(run: Path) -> bool | None:
     except (OSError, ValueError, OverflowError):
         return False
     return True
-
-
-def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:
-    """Makes the error for a run directory that cannot be written."""
-    reason = getattr(error, "strerror", None) or error
-    return ConfigError(f"run.dir is {run}, which cannot be written: {reason}.")
 
 
 def write_json(path: Path, found: Mapping[str, Any]) -> None:

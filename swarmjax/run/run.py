@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmjax import words
+from swarmjax import outputs, words
 from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
@@ -150,7 +150,7 @@ class Run:
         try:
             return directory.claim(Path("runs"), name)
         except OSError as error:
-            raise directory.unwritable(Path("runs") / name, error) from None
+            raise outputs.unwritable("run.dir", Path("runs") / name, error) from None
 
     def _broken(self, error: OSError | TrainingError) -> TrainingError:
         """Says why the run ends, and what is left of it."""
@@ -234,7 +234,7 @@ class Run:
         try:
             directory.write_json(self.path / directory.CONFIG, stored)
         except OSError as error:
-            raise directory.unwritable(self.path, error) from None
+            raise outputs.unwritable("run.dir", self.path, error) from None
 
     def _train_chunks(self) -> None:
         """Trains until the budget is spent, `run.stop_after` is reached or a stop is requested.
