@@ -119,15 +119,15 @@ _SOUND: dict[str, list[str]] = {
     "replay": ["policy=policy.npz", "policy=policy.npz suite=suite.yaml worst=1", "policy=b.npz"],
     "export": ["policy=policy.npz out=b.npz", "policy=policy.npz format=c", "run=run"],
     "report": ["run=run", "runs=run", "run=run out=there"],
-    "suite": ["suite=suite.yaml", "suite=dev", "suite=suite.yaml write=true"],
+    "suite": ["suite=suite.yaml", "suite=dev"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }
 # Words that are appended to give a process very little work; the last word for a key counts.
 _TINY: dict[str, list[str]] = {
-    "train": ["run.dry=true", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
+    "train": ["run.stop_after=1", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
     "replay": ["steps=2", "episodes=1", "workers=1"],
-    "suite": ["write=false"],
+    "suite": [],
     "reproduce": ["minutes=0.0001"],
     "export": [],
     "report": [],

@@ -103,8 +103,9 @@ def newest(run: Path) -> int:
 
 def logged(run: Path) -> list[int]:
     """Lists the updates in the metrics, in order; skips a line that was cut off."""
-    rows = directory.read_rows(run / directory.METRICS, None, whole=False)
-    return [row["update"] for row in rows]
+    log = run / directory.METRICS
+    whole = log.read_bytes().rfind(b"\n") + 1 if log.exists() else 0
+    return [row["update"] for row in directory.read_rows(log, whole)]
 
 
 def kills(seed: int, folder: Path) -> dict[str, Any]:
@@ -237,16 +238,22 @@ def terms(seed: int, folder: Path) -> dict[str, Any]:
 # Damaged checkpoints
 
 
+_KEEP_FIVE = """
+import sys
+from swarmjax import train
+from swarmjax.run import checkpoint
+checkpoint.KEPT = 5
+sys.exit(train.main(sys.argv[1:]))
+"""
+
+
 @functools.cache
 def _template() -> Path:
     """Trains and keeps three runs with several checkpoints each; two of the runs share a config."""
     folder = Path(tempfile.mkdtemp(prefix="faults-"))
-    more = ("run.keep_checkpoints=5",)
     for name, changed in (("mine", ()), ("twin", ()), ("other", ("algo.discount=0.9",))):
-        words = [*WORDS, *more, *changed, f"run.dir={folder / name}"]
-        subprocess.run(
-            [sys.executable, "-m", "swarmjax.train", *words], check=True, capture_output=True
-        )
+        words = [*WORDS, *changed, f"run.dir={folder / name}"]
+        subprocess.run([sys.executable, "-c", _KEEP_FIVE, *words], check=True, capture_output=True)
     return folder
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from swarmjax import command, outputs, words
+from swarmjax import command, words
 from swarmjax.config import (
     ConfigError,
     Section,
@@ -48,7 +48,7 @@ from swarmjax.run.settings import TrainConfig
 GRID = "grid."
 MOST_CELLS = 256
 # Keys that the sweep sets for each cell.
-_OWN = ("resume", "run.dir", "run.distributed", "run.dry")
+_OWN = ("resume", "run.dir", "run.distributed")
 _TICK_S = 1.0
 _SAVE_S = 180  # from the signal of Slurm to the end of a job
 
@@ -305,14 +305,12 @@ def main(arguments: Sequence[str]) -> int:
     settings, cells = parse(arguments)
     folder = Path(settings.dir)
     folder.mkdir(parents=True, exist_ok=True)
-    outputs.check("dir", [folder / "sweep.json"], overwrite=False)
     left = [cell for cell in cells if not cell.is_done]
     _say(f"{words.count(len(cells), 'cell')}, {len(cells) - len(left)} of them done before")
     codes = dict.fromkeys((cell.label for cell in cells), 0) | work(left, settings)
     lines = table.read_each({cell.run: cell.label for cell in cells})
     found = {"words": list(arguments), "codes": codes, "cells": [line._asdict() for line in lines]}
     directory.write_json(folder / "sweep.json", found)
-    outputs.note([folder / "sweep.json"])
     if lines:
         _say(table.text(lines))
     failed = [label for label, code in codes.items() if code not in (0, REQUEUE)]

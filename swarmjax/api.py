@@ -12,10 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from swarmjax import command, extension, policy_file
-from swarmjax.config import ConfigError, Section, files, show, to_dict
+from swarmjax.config import Section, files, to_dict
 from swarmjax.policy import Policy
 from swarmjax.run.errors import CheckpointError, TrainingError
 
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from swarmjax.run.settings import TrainConfig
 
 Row = dict[str, Any]
-Settings = Mapping[str, Any] | Sequence[str]
 
 
 class SwarmjaxError(ValueError):
@@ -122,10 +122,10 @@ _NOT_LEARNING = {"budget": 2**20, "algo.num_minibatches": 1, "algo.rollout_lengt
 
 @_one_error
 def train_policy(
-    settings: "Settings | TrainConfig" = (),
+    settings: "Mapping[str, Any] | TrainConfig" = MappingProxyType({}),
     *,
     on_update: Callable[[Row], object] | None = None,
-    log: Any = (),
+    log: "Sequence[Logger]" = (),
     extensions: Any = None,
 ) -> TrainResult:
     """Trains a swarm, as `python -m swarmjax.train` does, and writes a run directory.
@@ -133,13 +133,13 @@ def train_policy(
         result = swarmjax.train_policy({"stage": "s3", "arenas": 64, "budget": 500_000})
 
     Args:
-      settings: keys of the command and their values, as `{"algo.discount": 0.995}` or
-        `["algo.discount=0.995"]`; `stage` may also be a `StageConfig` or a list of them.
+      settings: keys of the command and their values, as `{"algo.discount": 0.995}`; `stage` may
+        also be a `StageConfig` or a list of them.
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
-      log: a `Logger` of `swarmjax.run.loggers`, or a list of them. It is called in its own thread,
-        so the run does not wait for it. If it raises, a warning is printed to standard error and
-        the run continues without it.
+      log: a list of `Logger`s of `swarmjax.run.loggers`. Each is called in its own thread, so the
+        run does not wait for it. If it raises, a warning is printed to standard error and the run
+        continues without it.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -157,11 +157,9 @@ def train_policy(
         config = settings
     else:
         more = {} if extensions is None else {"extensions": extensions}
-        config = load_run(*_given({**_mapping(settings), **more}))
-    if config.run.dry:
-        raise ConfigError("run.dry is true, but works only on the command line: leave it out.")
+        config = load_run(*_given({**settings, **more}))
     stop = Stop()
-    run = Run(config, stop=stop, loggers=_loggers(log), on_update=on_update)
+    run = Run(config, stop=stop, loggers=log, on_update=on_update)
     # Only the main thread can handle signals.
     in_main = threading.current_thread() is threading.main_thread()
     with stop if in_main else nullcontext():
@@ -240,20 +238,6 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
     return policy_file.read(path, extension.hand_over(extensions))
 
 
-def _loggers(given: Any) -> "list[Logger]":
-    """Returns the loggers in `given`, which may be a single one."""
-    from swarmjax.run.loggers import Logger
-
-    every = list(given) if isinstance(given, list | tuple) else [given]
-    for each in every:
-        if not isinstance(each, Logger):
-            raise ConfigError(
-                f"log is {show(each)}: give a Logger of swarmjax.run.loggers, or a list of "
-                "them; on_update takes a function of a row."
-            )
-    return every
-
-
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
     """Returns settings as command-line words, and the stages that no word can name."""
     rest = dict(settings)
@@ -268,25 +252,12 @@ def _stages(given: Any) -> list[dict[str, Any]]:
     """Converts stages to plain data. They may be settings, mappings, or names in a list."""
     from swarmjax.task import stage_files
 
-    every = [given] if isinstance(given, Section | Mapping) else list(given)
-    found: list[dict[str, Any]] = []
-    for each in every:
-        if isinstance(each, Section):
-            found.append(to_dict(each))
-        elif isinstance(each, Mapping):
-            found.append(dict(each))
-        else:
-            found.append(stage_files.read_stage(str(each)))
-    return found
+    def plain(stage: Any) -> dict[str, Any]:
+        if isinstance(stage, Section):
+            return to_dict(stage)
+        return dict(stage) if isinstance(stage, Mapping) else stage_files.read_stage(str(stage))
 
-
-def _mapping(settings: Settings) -> dict[str, Any]:
-    """Returns settings as a mapping; also converts `key=value` words."""
-    if isinstance(settings, Mapping):
-        return dict(settings)
-    if isinstance(settings, str):
-        raise ConfigError(f"settings is {settings!r}: give a list of words, as in ['stage=s3'].")
-    return {key: value for key, _, value in (word.partition("=") for word in settings)}
+    return [plain(each) for each in ([given] if isinstance(given, Section | Mapping) else given)]
 
 
 def _typed(value: Any) -> str:

@@ -1,7 +1,6 @@
 """Handles `--help` and the user's errors (one sentence, exit code 2) for all commands."""
 
 import ast
-import contextlib
 import importlib.util
 import inspect
 import os
@@ -10,7 +9,6 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
-from typing import Any, TextIO
 
 from swarmjax.config import ConfigError, files, reading, section
 from swarmjax.config.section import Section
@@ -42,25 +40,21 @@ def run(
     Returns:
       The exit code: 2 for the user's errors, which are printed in one sentence.
     """
-    module = _module(name)
-    return with_outputs(module, lambda: _run(module, main, settings, also))
-
-
-def _run(
-    module: str,
-    main: Callable[[Sequence[str]], int],
-    settings: type,
-    also: tuple[type[Exception], ...],
-) -> int:
-    arguments = sys.argv[1:]
+    module, arguments = _module(name), sys.argv[1:]
     try:
         if HELP & set(arguments):
             topics = [word for word in arguments if word not in HELP and "=" not in word]
             sys.stdout.write(help_text(settings, module, topics) + "\n")
-            return 0
-        return main(arguments)
+            code = 0
+        else:
+            code = main(arguments)
+        sys.stdout.flush()
+        return code
     except KeyboardInterrupt:
         return INTERRUPTED
+    except BrokenPipeError:  # nobody reads the output any more, as with `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
     except Exception as error:
         mistake = explain(error, also)
         if mistake is None:
@@ -89,66 +83,6 @@ def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[s
         name = reading.called(str(error.filename))
         return f"{name} cannot be used: {error.strerror}.", USER_ERROR
     return None
-
-
-class _Stream:
-    """Standard output or error, which may lose its reader or have no room.
-
-    Attributes:
-      error: why it could not be written; None if it could.
-    """
-
-    def __init__(self, stream: TextIO | None) -> None:
-        """Takes a stream; None if it was closed before the command began."""
-        self._stream = stream or open(os.devnull, "w")  # noqa: SIM115
-        self.error: OSError | None = None
-
-    def write(self, text: str) -> int:
-        """Writes text, or drops it."""
-        self._try(self._stream.write, text)
-        return len(text)
-
-    def flush(self) -> None:
-        """Writes what is buffered, or drops it."""
-        self._try(self._stream.flush)
-
-    def _try(self, act: Callable[..., object], *text: str) -> None:
-        try:
-            act(*text)
-        except OSError as error:
-            self.error = self.error or error
-            # Python flushes the stream again at exit. This must not fail again.
-            with contextlib.suppress(OSError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-
-    def __getattr__(self, name: str) -> Any:
-        """Behaves otherwise like the stream itself."""
-        return getattr(self._stream, name)
-
-
-def with_outputs(module: str, work: Callable[[], int]) -> int:
-    """Lets a command finish its work although nobody reads its output.
-
-    Args:
-      module: name of the command in messages.
-      work: does the work, and returns the exit code.
-
-    Returns:
-      The exit code; 1 instead of 0 if standard output had no room.
-    """
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = out, err = _Stream(sys.stdout), _Stream(sys.stderr)
-    try:
-        code = work()
-        out.flush()
-        if out.error is None or isinstance(out.error, BrokenPipeError):
-            return code
-        err.write(f"{module}: error: standard output cannot be written: {out.error.strerror}.\n")
-        return code or FAILED
-    finally:
-        out.flush()
-        err.flush()
-        sys.stdout, sys.stderr = before
 
 
 def line(name: str, *arguments: str) -> str:

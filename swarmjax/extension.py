@@ -23,6 +23,20 @@ from swarmjax.config import ConfigError, reading, show
 from swarmjax.config.foreign_code import explained
 from swarmjax.config.section import ByName
 
+# Names that the package itself uses, by kind of piece.
+TAKEN = {
+    "reward": (
+        *("progress", "path_progress", "proximity", "arrival"),
+        *("contact", "touching", "step_penalty"),
+    ),
+    "observation": ("infrared", "target_distance", "target_bearing"),
+    "level": (
+        *("random", "fixed", "map"),
+        *("trap", "fence", "bay", "row", "door", "maze", "circle", "crowd"),
+    ),
+    "network": ("mlp",),
+    "curriculum": ("sequential", "mixed", "adaptive"),
+}
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _LARGEST = 3.4e38  # as in `config.section`: float32 holds nothing beyond
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
@@ -34,13 +48,11 @@ class Piece:
 
     Attributes:
       kind: the kind of piece, as messages and policy files call it.
-      taken: names of this kind that the package itself uses.
       name: name of the piece in settings and policy files.
       function: the function.
     """
 
     kind: ClassVar[str] = ""
-    taken: ClassVar[tuple[str, ...]] = ()
 
     name: str
     function: Callable[..., Any]
@@ -57,15 +69,6 @@ class RewardTerm(Piece):
     """A term of the reward: `(swarmjax.task.reward.Step) -> [R]`, multiplied by its weight."""
 
     kind: ClassVar[str] = "reward"
-    taken: ClassVar[tuple[str, ...]] = (
-        "progress",
-        "path_progress",
-        "proximity",
-        "arrival",
-        "contact",
-        "touching",
-        "step_penalty",
-    )
 
     weight: float
 
@@ -78,7 +81,6 @@ class Observation(Piece):
     """
 
     kind: ClassVar[str] = "observation"
-    taken: ClassVar[tuple[str, ...]] = ("infrared", "target_distance", "target_bearing")
 
     size: int
     unit: str
@@ -88,39 +90,27 @@ class Observation(Piece):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of its entries."""
-        return (
-            (self.name,) if self.size == 1 else tuple(f"{self.name}_{i}" for i in range(self.size))
-        )
+        if self.size == 1:
+            return (self.name,)
+        return tuple(f"{self.name}_{i}" for i in range(self.size))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class LevelDrawing(Piece):
     """A way to draw a level of one arena: `(swarmjax.task.level.Level, key) -> Level`."""
 
     kind: ClassVar[str] = "level"
-    taken: ClassVar[tuple[str, ...]] = (
-        *("random", "fixed", "map"),
-        *("trap", "fence", "bay", "row", "door", "maze", "circle", "crowd"),
-    )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Network(Piece):
     """A Flax module for actor and critic; it takes [..., O] and returns features [..., F]."""
 
     kind: ClassVar[str] = "network"
-    taken: ClassVar[tuple[str, ...]] = ("mlp",)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class OwnCurriculum(Piece):
     """A curriculum: `(Schedule) -> Curriculum`, both of `swarmjax.curriculum.engine`."""
 
     kind: ClassVar[str] = "curriculum"
-    taken: ClassVar[tuple[str, ...]] = ("sequential", "mixed", "adaptive")
-
-
-KINDS = (RewardTerm, Observation, LevelDrawing, Network, OwnCurriculum)
 
 
 def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
@@ -130,19 +120,13 @@ def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], 
       weight: factor on the function's value. `task.reward.extra.NAME` overrides it.
       name: name of the term; None: the function's name.
     """
-
-    def make(function: Callable) -> RewardTerm:
-        return RewardTerm(name=name or function.__name__, function=function, weight=weight)
-
-    return make
+    return lambda function: RewardTerm(
+        name=name or function.__name__, function=function, weight=weight
+    )
 
 
 def observation(
-    size: int = 1,
-    unit: str = "1",
-    offset: float = 0.0,
-    scale: float = 1.0,
-    name: str | None = None,
+    size: int = 1, unit: str = "1", offset: float = 0.0, scale: float = 1.0, name: str | None = None
 ) -> Callable[[Callable], Observation]:
     """Turns a function into an observation.
 
@@ -154,11 +138,9 @@ def observation(
       name: name of the observation; None: the function's name.
     """
     numbers = {"size": size, "unit": unit, "offset": offset, "scale": scale}
-
-    def make(function: Callable) -> Observation:
-        return Observation(name=name or function.__name__, function=function, **numbers)
-
-    return make
+    return lambda function: Observation(
+        name=name or function.__name__, function=function, **numbers
+    )
 
 
 def level_drawing(function: Callable) -> LevelDrawing:
@@ -202,11 +184,11 @@ class Extensions(NamedTuple):
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""
-        every = {pieces[0].kind: pieces for pieces in self if pieces}
         return ByName(
             {
-                kind: ByName({each.name: each.digest for each in pieces})
-                for kind, pieces in every.items()
+                pieces[0].kind: ByName({each.name: each.digest for each in pieces})
+                for pieces in self
+                if pieces
             }
         )
 
@@ -216,8 +198,9 @@ NONE = Extensions()
 
 # Loading
 
-_files: dict[tuple[str, str], Extensions] = {}  # keys: path, and SHA-256 of the content
-_handed: dict[str, Extensions] = {}  # pieces from `hand_over`; keys: the words that stand for them
+# What was loaded: from a file by its path and the SHA-256 of its content, and by the words of
+# `hand_over`.
+_loaded: dict[str, Extensions] = {}
 _HANDED = "python:"  # prefix of the words that `hand_over` returns
 
 
@@ -233,25 +216,25 @@ def load(source: str | None) -> Extensions:
     if source is None:
         return NONE
     if source.startswith(_HANDED):
-        if source not in _handed:
+        if source not in _loaded:
             raise ConfigError(
                 f"extensions is {source}, which stands for pieces that were defined only in a "
                 "Python program: put them into a file and give extensions=FILE."
             )
-        return _handed[source]
+        return _loaded[source]
     path = Path(source)
     try:
         content = reading.read_bytes(path)
     except ConfigError as error:
-        _, _, reason = str(error).partition(" cannot be read: ")
-        raise ConfigError(f"extensions is {show(source)}, which cannot be read: {reason}") from None
-    key = (str(path.resolve()), hashlib.sha256(content).hexdigest())
-    if key not in _files:
-        _files[key] = collect(_pieces(vars(_import(path, content, key[1]))), source)
-    return _files[key]
+        raise ConfigError(f"extensions is {show(source)}, but {error}") from None
+    digest = hashlib.sha256(content).hexdigest()
+    key = f"{path.resolve()} {digest}"
+    if key not in _loaded:
+        _loaded[key] = collect(_pieces(_import(path, content, digest)), source)
+    return _loaded[key]
 
 
-def hand_over(given: object) -> str | None:
+def hand_over(given: Any) -> str | None:
     """Returns the value of the key `extensions` for pieces from a Python program.
 
     Args:
@@ -260,34 +243,23 @@ def hand_over(given: object) -> str | None:
     Raises:
       ConfigError: if `given` is anything else, or a piece is invalid.
     """
-    if given is None or isinstance(given, str):
-        return given
-    if isinstance(given, Path):
+    if given is None:
+        return None
+    if isinstance(given, str | Path):
         return str(given)
     if isinstance(given, types.ModuleType):
-        given = _pieces(vars(given))
-    pieces: list[Any] = list(given) if isinstance(given, Iterable) else [given]
-    for piece in pieces:
-        if not isinstance(piece, Piece):
-            raise ConfigError(
-                f"extensions holds {show(str(piece))}: give a file, a module, or functions with a "
-                "decorator of swarmjax.extension."
-            )
-    found = collect(pieces, "extensions")
-    digest = hashlib.sha256(repr(found.digests()).encode()).hexdigest()
-    word = f"{_HANDED}{digest[:12]}"
-    _handed[word] = found
+        given = _pieces(given)
+    pieces = collect(given if isinstance(given, Iterable) else [given], "extensions")
+    word = _HANDED + hashlib.sha256(repr(pieces.digests()).encode()).hexdigest()[:12]
+    _loaded[word] = pieces
     return word
 
 
 def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
     """Runs a file as a module with a unique name, so that it cannot shadow another module."""
-    name = f"_swarmjax_extension_{digest[:16]}"
-    if path.suffix != ".py":
-        raise ConfigError(f"extensions is {show(str(path))}: give a file that ends in .py.")
-    module = types.ModuleType(name)
+    module = types.ModuleType(f"_swarmjax_extension_{digest[:16]}")
     module.__file__ = str(path)
-    sys.modules[name] = module
+    sys.modules[module.__name__] = module
     try:
         # Do not use cached bytecode or lines. Both caches may be out of date, since they compare
         # only a file's size and its modification time in whole seconds.
@@ -295,17 +267,17 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
         with explained(f"{path} does not import"):
             exec(compile(content, str(path), "exec"), vars(module))
     except BaseException:
-        del sys.modules[name]
+        del sys.modules[module.__name__]
         raise
     return module
 
 
-def _pieces(names: Mapping[str, object]) -> list[Piece]:
-    """Lists the pieces among a module's names, without repeats."""
-    return list(dict.fromkeys(value for value in names.values() if isinstance(value, Piece)))
+def _pieces(module: types.ModuleType) -> list[Piece]:
+    """Lists the pieces of a module, without repeats."""
+    return list(dict.fromkeys(each for each in vars(module).values() if isinstance(each, Piece)))
 
 
-def collect(pieces: Iterable[Piece], where: str) -> Extensions:
+def collect(pieces: Iterable[object], where: str) -> Extensions:
     """Checks each piece and sorts the pieces by kind.
 
     Args:
@@ -313,19 +285,24 @@ def collect(pieces: Iterable[Piece], where: str) -> Extensions:
       where: name of the pieces' source in messages.
 
     Raises:
-      ConfigError: if a name is invalid or used twice, or a number is out of range.
+      ConfigError: if there is no piece, something else, or a name or number that is invalid.
     """
-    found: dict[str, dict[str, Any]] = {kind.kind: {} for kind in KINDS}
+    by_kind: dict[str, dict[str, Any]] = {kind: {} for kind in TAKEN}
     for piece in pieces:
+        if not isinstance(piece, Piece):
+            raise ConfigError(
+                f"{where} holds {show(str(piece))}: give a file, a module, or functions with a "
+                "decorator of swarmjax.extension."
+            )
         _check(piece, where)
-        if piece.name in found[piece.kind]:
+        if piece.name in by_kind[piece.kind]:
             raise ConfigError(f"{where}: {piece.kind} {piece.name} is there twice: rename one.")
-        found[piece.kind][piece.name] = piece
-    if not any(found.values()):
+        by_kind[piece.kind][piece.name] = piece
+    if not any(by_kind.values()):
         raise ConfigError(
             f"{where} holds no piece: put a decorator of swarmjax.extension before a function."
         )
-    return Extensions(*(tuple(each.values()) for each in found.values()))
+    return Extensions(*(tuple(each.values()) for each in by_kind.values()))
 
 
 def _check(piece: Piece, where: str) -> None:
@@ -335,28 +312,26 @@ def _check(piece: Piece, where: str) -> None:
             f"{label} is not a valid name: give 1 to 40 lower-case letters, digits and _, a letter "
             "first."
         )
-    if piece.name in piece.taken:
+    if piece.name in TAKEN[piece.kind]:
         raise ConfigError(f"{label} is the name of a built-in {piece.kind}: rename it.")
     for key in ("weight", "offset", "scale"):
         value = getattr(piece, key, 0.0)
         if type(value) not in (int, float) or not abs(value) <= _LARGEST:
             raise ConfigError(f"{label} has {key} {show(value)}: give a number that float32 holds.")
-    if isinstance(piece, Observation) and not (
-        isinstance(piece.size, int) and 1 <= piece.size <= 1000 and piece.scale
-    ):
-        raise ConfigError(
-            f"{label} has size {show(piece.size)} and scale {show(piece.scale)}: give a size of 1 "
-            "to 1000, and a scale other than 0, by which values are divided."
-        )
-    if isinstance(piece, Network) and not isinstance(piece.function, type):
-        raise ConfigError(f"{label} is not a class: decorate a flax.linen.Module.")
+    if isinstance(piece, Observation) and (type(piece.size) is not int or piece.size < 1):
+        raise ConfigError(f"{label} has size {show(piece.size)}: give a whole number, 1 or more.")
+    if isinstance(piece, Observation) and not piece.scale:
+        raise ConfigError(f"{label} has scale 0, by which values are divided: give another number.")
 
 
 # Digests
 
 
 def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
-    """Returns the syntax trees of a function or class, and of all that it uses from its file."""
+    """Returns the syntax trees of a function or class, and of all that it uses from its file.
+
+    They lack docstrings and the decorator, whose arguments are in settings and layouts already.
+    """
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
     except (OSError, TypeError, SyntaxError):
@@ -364,7 +339,11 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
             f"{getattr(thing, '__name__', thing)} has no source that can be read: define it in a "
             "file or a notebook."
         ) from None
-    found[thing.__name__] = ast.dump(_bare(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            node.decorator_list = [] if node in tree.body else node.decorator_list
+            del node.body[: ast.get_docstring(node) is not None]
+    found[thing.__name__] = ast.dump(tree)
     names = vars(sys.modules[thing.__module__]) if thing.__module__ in sys.modules else {}
     for name in sorted({node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}):
         value = names.get(name)
@@ -378,21 +357,6 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
     return found
 
 
-def _bare(tree: ast.Module) -> ast.Module:
-    """Removes the decorator and all docstrings.
-
-    The decorator's arguments are already recorded in settings and observation layouts.
-    """
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            if node in tree.body:
-                node.decorator_list = []
-            first = node.body[0]
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                del node.body[0]
-    return tree
-
-
 # What a policy needs
 
 
@@ -400,7 +364,7 @@ def check_needs(
     needs: Mapping[str, Mapping[str, str]],
     pieces: Extensions,
     where: str,
-    kinds: Iterable[str] = tuple(kind.kind for kind in KINDS),
+    kinds: Iterable[str] = tuple(TAKEN),
 ) -> None:
     """Refuses to run a policy without the pieces that it was trained with.
 
@@ -414,17 +378,14 @@ def check_needs(
       ConfigError: if a piece is missing or has changed.
     """
     held = pieces.digests()
-    wanted = ((kind, name) for kind in kinds for name in needs.get(kind, {}))
-    for kind, name in wanted:
-        digest, there = needs[kind][name], held.get(kind, {}).get(name)
-        if there is None:
-            raise ConfigError(
-                f"{where} was trained with the {kind} {name}, which is not part of swarmjax: give "
-                "extensions=FILE, the file that defines it."
-            )
+    wanted = [
+        (kind, name, digest) for kind in kinds for name, digest in needs.get(kind, {}).items()
+    ]
+    for kind, name, digest in wanted:
+        there = held.get(kind, {}).get(name)
         if there != digest:
+            holds = "no such piece" if there is None else f"one of digest {there[:12]}"
             raise ConfigError(
-                f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but the "
-                f"{kind} in extensions has digest {there[:12]}: give the version of the file that "
-                "was used for training."
+                f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but "
+                f"extensions holds {holds}: give extensions=FILE, the file of its training."
             )

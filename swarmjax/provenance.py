@@ -9,15 +9,8 @@ from pathlib import Path
 from swarmjax import words
 
 _PACKAGES = (
-    "swarmjax",
-    "jax",
-    "jaxlib",
-    "mujoco",
-    "mujoco-mjx",
-    "warp-lang",
-    "flax",
-    "optax",
-    "numpy",
+    *("swarmjax", "jax", "jaxlib", "mujoco", "mujoco-mjx"),
+    *("warp-lang", "flax", "optax", "numpy"),
 )
 
 

@@ -17,15 +17,13 @@ Examples:
   python -m swarmjax.train init_from=runs/first realism=real
   # go on with a run that was stopped
   python -m swarmjax.train resume=runs/first
-  # compile and print the memory that the run needs
-  python -m swarmjax.train stage=s6 run.dry=true
 """
 
 import sys
 from collections.abc import Sequence
 
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
-from swarmjax.run import heap, rank
+from swarmjax.run import heap
 from swarmjax.run.signals import Stop, StoppedError
 
 
@@ -35,8 +33,6 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.load_settings import load_run
 
         settings = load_run(arguments)
-        if rank.needs_parent(settings.run):
-            return rank.supervise()
         from swarmjax.run.display import Display
         from swarmjax.run.run import Run
 
@@ -76,5 +72,4 @@ if __name__ == "__main__":
     from swarmjax.run.settings import TrainConfig
 
     heap.share()
-    rank.follow_parent()
     sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))

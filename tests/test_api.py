@@ -155,13 +155,6 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_words_of_the_command_line_are_settings_too(tmp_path: Path) -> None:
-    words = ["stage=s1", "arenas=4", "algo.num_minibatches=2", "algo.rollout_length=4", "budget=16"]
-    more = ["sim.impl=jax", "run.tensorboard=false", f"run.dir={tmp_path / 'run'}"]
-    assert swarmjax.train_policy(words + more).policy.meta["config"]["stage"][0]["name"] == "s1"
-
-
-@pytest.mark.slow
 def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
     settings = TINY | {"stage": extensions.RING, "run.dir": tmp_path / "run", "budget": 16}
     result = swarmjax.train_policy(settings, extensions=str(extensions.OWN))
@@ -173,11 +166,13 @@ def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
     assert [cell["cell"] for cell in found["cells"]] == ["ring"]
     with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the observation nearest_ro"):
         swarmjax.evaluate_policy(result.policy, episodes=2)
-    with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the network residual, whi"):
+    with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the network residual of "):
         swarmjax.load_policy(result.run / "policy.npz")
 
 
-@pytest.mark.parametrize("call", [swarmjax.make_env, lambda: swarmjax.train_policy(["stage=s1"])])
+@pytest.mark.parametrize(
+    "call", [swarmjax.make_env, lambda: swarmjax.train_policy({"stage": "s1"})]
+)
 def test_64_bits_are_refused_in_one_sentence(
     call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,11 +194,8 @@ def test_64_bits_are_refused_in_one_sentence(
         ""),
         (lambda: swarmjax.make_env("s3", robot="legs"), r"^robot is 'legs': give one of paper"),
         (lambda: swarmjax.make_env("s3", arenas=0), r"^arenas is 0: give 1 to 1048576"),
-        (lambda: swarmjax.make_env("s3", extensions="no.py"), r"^extensions is 'no.py', which "
-        "cann"),
+        (lambda: swarmjax.make_env("s3", extensions="no.py"), r"^extensions is 'no.py', but no"),
         (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is not a key: did y"),
-        (lambda: swarmjax.train_policy("stage=s3"), r"^settings is 'stage=s3': give a list of wor"),
-        (lambda: swarmjax.train_policy({"run.dry": True}), r"^run\.dry is true, but works only on"),
         (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),
         (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is no file: give the path of a policy"),
     ],

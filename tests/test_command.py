@@ -11,7 +11,6 @@ from pathlib import Path
 
 import policies
 import pytest
-from runs import row, write
 
 from swarmjax import command
 from swarmjax.config import ConfigError, files, section, to_dict
@@ -27,7 +26,6 @@ from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.settings import TrainConfig
 from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
-from swarmjax.verify import VerifyConfig
 from swarmjax.watch.config import WatchConfig
 
 # The loader and the settings class of each command.
@@ -39,7 +37,6 @@ COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.replay": (partial(load_levels, ReplayConfig), ReplayConfig),
     "swarmjax.reproduce": (partial(files.load, ReproduceConfig), ReproduceConfig),
     "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
-    "swarmjax.verify": (partial(files.load, VerifyConfig), VerifyConfig),
     "swarmjax.watch": (partial(files.load, WatchConfig), WatchConfig),
 }
 EVERY_EXAMPLE = [
@@ -115,33 +112,9 @@ def _shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize(
-    ("line", "code", "error"),
-    [
-        pytest.param(
-            "$RUN.report --help all | true; exit ${PIPESTATUS[0]}", 0, "", marks=pytest.mark.slow
-        ),
-        pytest.param("$RUN.report --help all >&-", 0, "", marks=pytest.mark.slow),
-        ("$RUN.report --help all >/dev/full", 1, "swarmjax.report: error: standard output cannot"),
-        pytest.param(
-            "$RUN.report run=run | true; exit ${PIPESTATUS[0]}", 0, "", marks=pytest.mark.slow
-        ),
-        ("$RUN.report run=run >&-", 0, ""),
-        ("$RUN.report run=run >/dev/full", 1, "swarmjax.report: error: standard output cannot be"),
-        pytest.param("$RUN.report rum=run 2>&-", 2, "", marks=pytest.mark.slow),
-        pytest.param("$RUN.report rum=run 2>/dev/full", 2, "", marks=pytest.mark.slow),
-        ("$RUN.report rum=run >&- 2>&-", 2, ""),
-    ],
-)
-def test_a_command_does_its_work_although_nobody_reads(
-    tmp_path: Path, line: str, code: int, error: str
-) -> None:
-    run = write(tmp_path / "run", [row(0)])
-    done = _shell(line, tmp_path)
-    assert done.returncode == code
-    assert done.stderr.startswith(error)
-    assert done.stderr.count("\n") == bool(error)
-    assert (run / "report" / "report.html").exists() == ("run=run" in line)
+def test_a_command_whose_reader_is_gone_ends_without_a_traceback(tmp_path: Path) -> None:
+    done = _shell("$RUN.report --help all | true; exit ${PIPESTATUS[0]}", tmp_path)
+    assert (done.returncode, done.stderr) in ((1, ""), (0, ""))  # 0 if it wrote before `true` ended
 
 
 def test_a_worker_that_was_killed_is_one_sentence(

@@ -86,11 +86,10 @@ def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
          r"a\.py: reward progress is the name of a built-in reward: rename it"),
         (TERM.replace("def speed", "def Speed"),
          r"a\.py: reward Speed is not a valid name: give 1 to 40 lower-case letters"),
-        ("@observation(size=0)\ndef a(view): return 0", r"observation a has size 0 and scale 1: "),
-        ("@observation(scale=0)\ndef a(view): return 0", r"observation a has size 1 and scale 0: "),
+        ("@observation(size=0)\ndef a(view): return 0", r"observation a has size 0: "),
+        ("@observation(scale=0)\ndef a(view): return 0", r"observation a has scale 0, by "),
         ("@reward_term\ndef a(step): return 0",
          r"a\.py holds no piece: put a decorator of swarmjax\.extension before a function"),
-        ("@network\ndef a(x): return x", r"a\.py: network a is not a class: decorate a flax"),
     ],
 )  # fmt: skip
 def test_an_unsound_file_is_one_sentence(tmp_path: Path, body: str, sentence: str) -> None:
@@ -99,14 +98,7 @@ def test_an_unsound_file_is_one_sentence(tmp_path: Path, body: str, sentence: st
 
 def test_a_missing_file_is_one_sentence() -> None:
     assert refusal(extension.load, "no/such.py") == (
-        "extensions is 'no/such.py', which cannot be read: No such file or directory."
-    )
-
-
-def test_a_file_of_another_kind_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("x")
-    assert refusal(extension.load, str(tmp_path / "a.txt")).endswith(
-        "give a file that ends in .py."
+        "extensions is 'no/such.py', but no/such.py cannot be read: No such file or directory."
     )
 
 
@@ -129,18 +121,18 @@ def test_what_is_no_piece_is_refused() -> None:
 
 
 def test_names_of_the_package_are_taken() -> None:
-    assert set(extension.RewardTerm.taken) == set(reward.TERMS)
-    assert extension.LevelDrawing.taken == stage_config.BUILT_IN
+    assert set(extension.TAKEN["reward"]) == set(reward.TERMS)
+    assert extension.TAKEN["level"] == stage_config.BUILT_IN
     inputs = {re.sub(r"_\d+$", "", name) for name in observation.NAMES}
-    assert set(extension.Observation.taken) == inputs
+    assert set(extension.TAKEN["observation"]) == inputs
 
 
 def test_a_piece_that_is_missing_or_has_changed_is_named() -> None:
     found = extension.load(str(extensions.OWN))
     needs = {"observation": {"nearest_robot": "0" * 64}}
     assert refusal(extension.check_needs, needs, Extensions(), "p.npz") == (
-        "p.npz was trained with the observation nearest_robot, which is not part of swarmjax: give "
-        "extensions=FILE, the file that defines it."
+        "p.npz was trained with the observation nearest_robot of digest 000000000000, but "
+        "extensions holds no such piece: give extensions=FILE, the file of its training."
     )
     changed = refusal(extension.check_needs, needs, found, "p.npz")
     assert changed.startswith("p.npz was trained with the observation nearest_robot of digest 0000")
@@ -152,13 +144,6 @@ def test_only_the_kinds_that_matter_are_asked_for() -> None:
     assert refusal(extension.check_needs, needs, Extensions(), "p", ["reward"]).startswith("p was ")
 
 
-MUTE = """
-class Mute(Exception):
-    def __str__(self):
-        raise RuntimeError
-"""
-
-
 @pytest.mark.parametrize(
     ("body", "said"),
     [
@@ -166,8 +151,6 @@ class Mute(Exception):
         ("raise SystemExit('a')", "SystemExit: a."),
         ("class Own(BaseException): pass\nraise Own('b')", "Own: b."),
         ("raise GeneratorExit", "GeneratorExit: no reason given."),
-        (f"{MUTE}\nraise Mute", "Mute: no reason given."),
-        ("raise ValueError('\\x1b[31m')", "ValueError: \\x1b[31m."),
     ],
 )
 def test_whatever_a_file_raises_is_one_sentence(tmp_path: Path, body: str, said: str) -> None:
@@ -175,9 +158,9 @@ def test_whatever_a_file_raises_is_one_sentence(tmp_path: Path, body: str, said:
     assert refusal(extension.load, mine) == f"{mine} does not import: {said}"
 
 
-@pytest.mark.parametrize("code", ["import sys; sys.exit()", "raise Mute", "raise BaseException"])
+@pytest.mark.parametrize("code", ["import sys; sys.exit()", "raise BaseException"])
 def test_whatever_a_piece_raises_is_one_sentence(tmp_path: Path, code: str) -> None:
-    body = f"{MUTE}\n@reward_term(weight=1.0)\ndef mine(step):\n    {code}\n"
+    body = f"@reward_term(weight=1.0)\ndef mine(step):\n    {code}\n"
     words = ["stage=s1", f"extensions={extensions.write(tmp_path / 'mine.py', body)}"]
     config = load_train(words)
     assert f"{tmp_path / 'mine.py'}: reward mine fails: " in refusal(programs.load_world, config)
@@ -197,7 +180,7 @@ def test_whatever_a_piece_raises_is_one_sentence(tmp_path: Path, code: str) -> N
         ("reward_term(weight=1.0, name=3)", "reward 3 is not a valid name: give 1 to 40"),
         ("observation(scale='a')", "observation mine has scale 'a': give a number that float32"),
         ("observation(offset=jnp.inf)", "observation mine has offset inf: give a number that floa"),
-        ("observation(size='a')", "observation mine has size 'a' and scale 1: give a size of 1"),
+        ("observation(size='a')", "observation mine has size 'a': give a whole number, 1 or mo"),
     ],
 )
 def test_a_number_of_a_wrong_kind_names_the_file(tmp_path: Path, decorator: str, said: str) -> None:

@@ -24,7 +24,6 @@ SOUND = {
     "swarmjax.replay": ["policy=a.npz"],
     "swarmjax.reproduce": [],
     "swarmjax.suite": ["suite=dev"],
-    "swarmjax.verify": ["run=a"],
     "swarmjax.watch": ["run=a"],
 }
 TEXTS = [

@@ -60,7 +60,7 @@ def test_an_array_gives_each_job_seeds_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("code", "requeued", "ends"), [(75, True, 0), (0, False, 0), (2, False, 2)]
+    ("code", "requeued", "ends"), [(75, True, 0), (134, True, 0), (0, False, 0), (2, False, 2)]
 )
 def test_a_job_on_several_nodes_is_asked_for_again_by_its_exit_code(
     code: int, requeued: bool, ends: int, tmp_path: Path

@@ -42,32 +42,28 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
-    flat = parse(cls, overrides)
-    first, typed = defaults(cls.command), {k: choice for k, choice in flat.items() if choices(k)}
-    by_whole, values = _read_whole(cls, (first | typed).get(_WHOLE))
-    chosen = first | by_whole | typed
-    by_group = {
-        group: read_choice(group, choice) for group, choice in chosen.items() if group != _WHOLE
-    }
-    others = nest({key: value for key, value in flat.items() if key not in typed})
-    mapping = merge(merge(by_group, values), others)
+    first, typed = defaults(cls.command), parse(cls, overrides)
+    algo, whole = _read_whole(cls, (first | typed).get(_WHOLE))
+    flat = whole | typed
+    chosen = first | {key: value for key, value in flat.items() if choices(key)}
+    by_group = {group: read_choice(group, choice) for group, choice in chosen.items()} | algo
+    mapping = merge(by_group, nest({k: value for k, value in flat.items() if k not in chosen}))
     return section.build(cls, complete(mapping, chosen) if complete else mapping)
 
 
-def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, str], dict[str, Any]]:
-    """Reads the choices and values of a file of the group that may set keys of all sections."""
+def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Reads a file of the group that may set keys of all sections: its section, and the others."""
     if choice is None:
         return {}, {}
     found = read_choice(_WHOLE, choice)
     if not isinstance(found.get(_WHOLE), dict):  # it has keys of its own section only
-        found = {_WHOLE: found}
-    return read_shared(cls, found, Path(choice))
+        return {_WHOLE: found}, {}
+    own = found.pop(_WHOLE)
+    return {_WHOLE: own}, parse(cls, shared_words(cls, found, Path(choice)))
 
 
-def read_shared(
-    cls: type[Section], found: Mapping[str, Any], path: Path
-) -> tuple[dict[str, str], dict[str, Any]]:
-    """Separates the choices of files, by group, from the other settings of a file for a whole run.
+def shared_words(cls: type[Section], found: Mapping[str, Any], path: Path) -> list[str]:
+    """Returns the settings of a file for a whole run as words.
 
     Args:
       cls: the command's dataclass. Its `shared` lists the keys and sections that such a file, which
@@ -87,12 +83,12 @@ def read_shared(
                 f"{path}: {key} cannot be set by a file, which may set {', '.join(cls.shared)}: "
                 f"remove it, and give {key} on the command line."
             )
-    chosen = {
-        key: beside(path.parent, value)
-        for key, value in found.items()
-        if isinstance(value, str) and choices(key)
-    }
-    return chosen, {key: value for key, value in found.items() if key not in chosen}
+    return write_words(
+        {
+            key: beside(path.parent, value) if isinstance(value, str) and choices(key) else value
+            for key, value in found.items()
+        }
+    )
 
 
 def is_path(choice: str) -> bool:

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from swarmjax.config.values import ConfigError, show
+from swarmjax.config.values import ConfigError
 
 
 @contextlib.contextmanager
@@ -21,14 +21,5 @@ def explained(what: str) -> Iterator[None]:
     except (ConfigError, KeyboardInterrupt):
         raise
     except BaseException as error:
-        raise ConfigError(f"{what}: {_describe(error)}.") from None
-
-
-def _describe(error: BaseException) -> str:
-    """Formats an error of a user's code: its type and first line."""
-    try:
-        text = str(error).strip()
-    except BaseException:  # the text is the user's code as well
-        text = ""
-    first = (text or "no reason given").splitlines()[0].rstrip(".")
-    return f"{type(error).__name__}: {first if first.isprintable() else show(first, quote='')}"
+        first = (str(error).strip().splitlines() or ["no reason given"])[0].rstrip(".")
+        raise ConfigError(f"{what}: {type(error).__name__}: {first}.") from None

@@ -34,15 +34,12 @@ from swarmjax.evaluate.evaluation import Evaluation, evaluate
 from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.exit_codes import INTERRUPTED
 
-_NAMES = ("result.json", "levels.csv")  # the files in the folder of a result
-
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings, said = trained_settings.load(EvaluateConfig, arguments)
     out = None if settings.out is None else Path(settings.out)
     if out is not None:
-        outputs.check("out", _files(out), overwrite=settings.overwrite)
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
@@ -67,18 +64,13 @@ def _say(sentence: str) -> None:
     sys.stdout.flush()
 
 
-def _files(out: Path) -> list[Path]:
-    """Lists the files that `_write` may write."""
-    return [out] if out.suffix == ".json" else [out / name for name in _NAMES]
-
-
 def _content(out: Path, evaluation: Evaluation) -> dict[Path, bytes]:
     """Makes the JSON file, or all files of a folder."""
     text = (json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n").encode()
     if out.suffix == ".json":
         return {out: text}
     levels = evaluate_table.levels(evaluation.entrants, evaluation.trials)
-    return dict(zip(_files(out), (text, levels.encode()), strict=True))
+    return {out / "result.json": text, out / "levels.csv": levels.encode()}
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.outputs import OVERWRITE
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
@@ -59,7 +58,6 @@ class JudgeConfig(Section):
     extensions: str | None = setting(
         None, "Python file with the policies' extension; it is executed"
     )
-    overwrite: bool = field(default=False, metadata=OVERWRITE)
 
     @property
     def step_limit(self) -> int:

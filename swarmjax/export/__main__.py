@@ -20,7 +20,7 @@ Examples:
 import re
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,6 @@ def main(arguments: Sequence[str]) -> int:
     settings = files.load(ExportConfig, arguments)
     if settings.policy is not None:
         out = _target(settings, Path(settings.policy).parent)
-        _check_free(settings, [out])
         convert(settings, Path(settings.policy), out)
         sys.stdout.write(f"{out}: the policy of {settings.policy}.\n")
         return 0
@@ -55,7 +54,6 @@ def main(arguments: Sequence[str]) -> int:
     trained = from_stored(read_config(run))
     trained = settle(replace(trained, extensions=settings.extensions))
     targets = _targets(settings, trained)
-    _check_free(settings, targets.values())
     leaves, update, skipped, *_ = checkpoint.find(run, settings.step)
     for sentence in skipped:
         sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
@@ -94,15 +92,6 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
     if settings.format == "webots":
         _check_controller(out)
     return out
-
-
-def _check_free(settings: ExportConfig, paths: Iterable[Path]) -> None:
-    """Refuses to replace files of other origin; `convert` checks those of a folder.
-
-    A run's own policy is replaced, which training has written.
-    """
-    if settings.format == "onnx" or (settings.format == "npz" and settings.out is not None):
-        outputs.check("out", paths, overwrite=settings.overwrite)
 
 
 def _default(settings: ExportConfig) -> str:
@@ -149,9 +138,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
         made = c.render(trained)
     else:
         made = webots.render(trained, content, settings.sensors, out.name)
-    inside = {out / name: each for name, each in made.items()}
-    outputs.check("out", inside, overwrite=settings.overwrite)
-    outputs.write(inside)
+    outputs.write({out / name: each for name, each in made.items()})
 
 
 def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:

@@ -1,11 +1,10 @@
 """The settings of an export."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.outputs import OVERWRITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +25,6 @@ class ExportConfig(Section):
     out: str | None = setting(
         None, "file or folder to write; null: in run or beside policy, named by format and step"
     )
-    overwrite: bool = field(default=False, metadata=OVERWRITE)
     extensions: str | None = setting(
         None, "Python file with the pieces that the policy needs; it is executed"
     )

@@ -85,22 +85,20 @@ def _hash_source(text: str) -> str:
     return f"'sha256-{_base64(hashlib.sha256(text.encode()).digest())}'"
 
 
-def write(out: Path, files: Mapping[str, bytes], *, overwrite: bool = False) -> list[Path]:
+def write(out: Path, files: Mapping[str, bytes]) -> list[Path]:
     """Writes files into a directory and creates the directory.
 
     Args:
       out: the directory.
       files: contents by name; a name may contain subfolders.
-      overwrite: whether files that this function did not write are replaced.
 
     Returns:
       The paths of the files, in order.
 
     Raises:
-      ConfigError: if a file cannot be written, or must not be replaced.
+      ConfigError: if a file cannot be written.
     """
     paths = [out / name for name in files]
-    outputs.check("out", paths, overwrite=overwrite)
     outputs.make_room("out", out, out)
     outputs.write(dict(zip(paths, files.values(), strict=True)))
     return paths

@@ -43,9 +43,9 @@ def main(arguments: Sequence[str]) -> int:
     settings, said = trained_settings.load(ReplayConfig, arguments)
     entrants = evaluate_trials.read_policies(settings.policies, settings.extensions)
     out, video = Path(settings.out), settings.video and Path(settings.video)
-    _check_output("out", out, ".html", settings)
+    _check_output("out", out, ".html")
     if video:
-        _check_output("video", video, ".mp4", settings)
+        _check_output("video", video, ".mp4")
         replay_video.check()
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal
@@ -71,11 +71,10 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _check_output(key: str, path: Path, ending: str, settings: ReplayConfig) -> None:
+def _check_output(key: str, path: Path, ending: str) -> None:
     """Checks that a file can be written."""
     if path.suffix != ending:
         raise ConfigError(f"{key} is {path}: give a name that ends with {ending}.")
-    outputs.check(key, [path], overwrite=settings.overwrite)
     outputs.make_room(key, path)
 
 

@@ -88,7 +88,6 @@ def write(
                 for picture in _pictures(settings, episodes):
                     film.append_data(picture)
                     report(1)
-        outputs.note([path])
     except OSError as error:
         raise outputs.unwritable("video", path, error) from None
 

@@ -28,14 +28,13 @@ from swarmjax.report.config import ReportConfig
 PAGE = "report.html"
 
 
-def write(run: Path, out: Path, made_by: str, *, overwrite: bool = False) -> list[Path]:
+def write(run: Path, out: Path, made_by: str) -> list[Path]:
     """Writes the report of a run.
 
     Args:
       run: the run directory.
       out: directory of the report; it is created.
       made_by: the command that makes the report, for the page.
-      overwrite: whether files of other origin are replaced.
 
     Returns:
       The files; the page is the last one.
@@ -50,7 +49,7 @@ def write(run: Path, out: Path, made_by: str, *, overwrite: bool = False) -> lis
     figures = report_figures.png_files(history)
     page = report_page.page(f"Report of {run}", made_by, history, figures)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
-    return builder.write(out, content, overwrite=overwrite)
+    return builder.write(out, content)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -62,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     run = Path(settings.run or "")
     out = Path(settings.out) if settings.out else run / "report"
     made_by = command.line("report", *arguments)
-    written = write(run, out, made_by, overwrite=settings.overwrite)
+    written = write(run, out, made_by)
     figures = words.count(len(written) - 1, "figure")
     sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
     return 0

@@ -1,10 +1,9 @@
 """The settings of a report."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 from swarmjax.config import ConfigError, Section, setting
-from swarmjax.outputs import OVERWRITE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +19,6 @@ class ReportConfig(Section):
         "separated by commas; prints a table with one line for all runs of the same settings",
     )
     out: str | None = setting(None, "directory of the report of a run; null: <run>/report")
-    overwrite: bool = field(default=False, metadata=OVERWRITE)
 
     def _check(self) -> None:
         if (self.run is None) == (self.runs is None):

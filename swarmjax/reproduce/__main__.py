@@ -100,7 +100,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
 def _write(path: Path, content: Mapping[str, Any]) -> None:
     """Writes one of the command's two JSON files."""
     text = json.dumps({"format": FORMAT, **content}, indent=2, allow_nan=False) + "\n"
-    builder.write(path.parent, {path.name: text.encode()}, overwrite=True)
+    builder.write(path.parent, {path.name: text.encode()})
 
 
 def _judge(out: Path, given: ReproduceConfig) -> None:

@@ -42,7 +42,7 @@ def write(out: Path) -> Path:
     lacks = {name: data.lacking(plot.arms) for name, plot in reproduce_figures.PLOTS.items()}
     content = {f"{FIGURES}/{name}.png": png for name, png in figures.items()}
     content[PAGE] = _page(data, figures, lacks).encode()
-    return builder.write(out, content, overwrite=True)[-1]
+    return builder.write(out, content)[-1]
 
 
 def _page(

@@ -35,6 +35,7 @@ from swarmjax.run.errors import CheckpointError, TrainingError
 
 Leaves = dict[str, np.ndarray]
 
+KEPT = 2  # how many of the newest checkpoints are kept: the older one serves if one is damaged
 FOLDER = hosts.CHECKPOINTS
 _STATE, _META, _SUMS = "state", "meta.json", "SHA256SUMS"
 _TEMPORARY = ".{}.tmp"  # the name of a folder while it is written or removed
@@ -82,13 +83,13 @@ class Checkpoints:
     A thread writes them while training continues. The newest are kept.
     """
 
-    def __init__(self, run: Path, keep: int, update: int | None = None) -> None:
-        """Opens `run`/checkpoints, to keep the `keep` newest.
+    def __init__(self, run: Path, update: int | None = None) -> None:
+        """Opens `run`/checkpoints.
 
         A resumed run gives the `update` that it continues from. Later checkpoints were skipped as
         damaged: they are moved to `run`/passed_over.
         """
-        self._run, self._keep, self._owner = run, keep, _owner(run)
+        self._run, self._owner = run, _owner(run)
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
         if update is not None and hosts.is_first():
@@ -99,15 +100,8 @@ class Checkpoints:
                 shutil.rmtree(aside, ignore_errors=True)
                 aside.parent.mkdir(exist_ok=True)
                 path_of(run, step).rename(aside)
-            directory.cut_rows(run / directory.SAVED, update + 1)
 
-    def save(
-        self,
-        state: Any,
-        update: int,
-        logs: Mapping[str, int] | None = None,
-        of: Mapping[str, Any] | None = None,
-    ) -> None:
+    def save(self, state: Any, update: int, logs: Mapping[str, int] | None = None) -> None:
         """Begins to write a state.
 
         Does nothing if the update is already saved, or if what was learned is not finite.
@@ -116,7 +110,6 @@ class Checkpoints:
           state: the training state; it is copied before this returns.
           update: updates that are done.
           logs: bytes of each log at this update, by name.
-          of: further entries for the checkpoint's row in the list of checkpoints.
 
         Raises:
           TrainingError: if the previous checkpoint could not be written.
@@ -129,7 +122,7 @@ class Checkpoints:
         # The next call of the program overwrites the state. On a CPU, NumPy may share the state's
         # memory.
         leaves = {name: np.array(leaf) for name, leaf in to_leaves(state).items()}
-        self._pending = self._thread.submit(self._write, leaves, meta, dict(of or {}))
+        self._pending = self._thread.submit(self._write, leaves, meta)
 
     def wait(self) -> None:
         """Waits until the pending checkpoint is written.
@@ -141,13 +134,13 @@ class Checkpoints:
         if pending is not None:
             pending.result()
 
-    def _write(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
+    def _write(self, leaves: Leaves, meta: dict[str, Any]) -> None:
         update = meta["update"]
         try:
             if self._is_removed():  # writing would make the directory again
                 raise FileNotFoundError
             if _is_sound(leaves) and update not in steps(self._run):
-                self._write_folder(leaves, meta | self._owner, row)
+                self._write_folder(leaves, meta | self._owner)
                 self._prune()
         except Exception as error:  # Orbax raises errors of many types
             why = f"{self._run} was removed" if self._is_removed() else _why(error)
@@ -157,7 +150,7 @@ class Checkpoints:
     def _is_removed(self) -> bool:
         return bool(self._owner) and not (self._run / directory.CONFIG).exists()
 
-    def _write_folder(self, leaves: Leaves, meta: dict[str, Any], row: directory.Row) -> None:
+    def _write_folder(self, leaves: Leaves, meta: dict[str, Any]) -> None:
         meta |= {"digest": digest(leaves)}
         folder = path_of(self._run, meta["update"])
         temporary = folder.with_name(_TEMPORARY.format(folder.name))
@@ -172,12 +165,10 @@ class Checkpoints:
             temporary.rename(folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-        with directory.Log(self._run / directory.SAVED) as log:
-            log.write([{"update": meta["update"], "digest": meta["digest"], **row}])
 
     def _prune(self) -> None:
         """Removes all checkpoints except the newest ones."""
-        for step in steps(self._run)[self._keep :]:
+        for step in steps(self._run)[KEPT:]:
             folder = path_of(self._run, step)
             shutil.rmtree(folder.rename(folder.with_name(_TEMPORARY.format(step))))
 
@@ -343,29 +334,6 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
         return jax.random.wrap_key_data(array) if is_key else array
 
     return jax.tree_util.tree_map_with_path(fill, template)
-
-
-def of_seed(leaves: Leaves, lane: int, seeds: int) -> Leaves:
-    """Extracts one seed from a run's checkpoint.
-
-    Args:
-      leaves: [N, ...] arrays of a run.
-      lane: index of the seed, 0..N-1.
-      seeds: N, the number of seeds in the config.
-
-    Returns:
-      The leaves of that seed, without the leading axis.
-
-    Raises:
-      CheckpointError: if the checkpoint has another number of seeds.
-    """
-    found = leaves["update"].shape
-    if found != (seeds,):
-        raise CheckpointError(
-            f"the checkpoint holds {found[0] if found else 'no axis of'} seeds, but the config "
-            f"says {seeds}: it belongs to another run."
-        )
-    return {name: leaf[lane] for name, leaf in leaves.items()}
 
 
 def _name(path: tuple) -> str:

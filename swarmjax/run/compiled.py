@@ -26,19 +26,12 @@ class Compiled:
     Attributes:
       call: (schedule, state [N], n) -> (state [N], metrics [N, rows]). The state is donated.
       seconds: time spent tracing and compiling.
-      state_bytes: device memory for the training state.
-      work_bytes: device memory that the program needs beyond the state.
+      memory_bytes: device memory that training needs.
     """
 
     call: Callable[[Schedule, TrainState, np.int32], tuple[TrainState, dict]]
     seconds: float
-    state_bytes: int
-    work_bytes: int
-
-    @property
-    def total_bytes(self) -> int:
-        """Device memory that training needs."""
-        return self.state_bytes + self.work_bytes
+    memory_bytes: int
 
 
 def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any) -> Compiled:
@@ -62,11 +55,11 @@ def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any)
     assert needed is not None  # both CPU and GPU report it
     # The returned state reuses the memory of the donated state. Only the metrics need more memory.
     returned = needed.output_size_in_bytes - needed.alias_size_in_bytes
+    each = needed.argument_size_in_bytes + needed.temp_size_in_bytes + returned
     return Compiled(
         call=call if groups == 1 else partial(_call_at_once, call, groups),
         seconds=time.perf_counter() - began,
-        state_bytes=groups * needed.argument_size_in_bytes,
-        work_bytes=groups * (needed.temp_size_in_bytes + returned),
+        memory_bytes=groups * each,
     )
 
 

@@ -21,14 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from swarmjax.config import ConfigError
-from swarmjax.outputs import replacing
+from swarmjax.outputs import replacing, unwritable
 from swarmjax.run.errors import CheckpointError
 
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
-# A row for each checkpoint that was written, even if it has been removed since.
-SAVED = "checkpoints.jsonl"
 # Keys of a stored config that may change when a run is resumed: they do not affect past results.
 MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 
@@ -58,7 +56,7 @@ def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
             run.mkdir(parents=True, exist_ok=True)
             _lock(run, held)
         except OSError as error:
-            raise unwritable(run, error) from None
+            raise unwritable("run.dir", run, error) from None
         try:
             yield
         finally:
@@ -143,12 +141,6 @@ def is_written(run: Path) -> bool | None:
     except (OSError, ValueError, OverflowError):
         return False
     return True
-
-
-def unwritable(run: Path, error: OSError | ValueError) -> ConfigError:
-    """Makes the error for a run directory that cannot be written."""
-    reason = getattr(error, "strerror", None) or error
-    return ConfigError(f"run.dir is {run}, which cannot be written: {reason}.")
 
 
 def write_json(path: Path, found: Mapping[str, Any]) -> None:
@@ -240,39 +232,12 @@ def cut(path: Path, length: int) -> None:
         file.truncate(length)
 
 
-def bring(source: Path, run: Path, logs: Mapping[str, int]) -> None:
-    """Copies the logs of a run that is resumed in another directory.
-
-    Args:
-      source: the old directory.
-      run: the new directory. If a run has already begun there, nothing is copied.
-      logs: bytes to copy of each log, by name.
-    """
-    if (run / CONFIG).exists():
-        return
-    for name in LOGS:
-        if (source / name).exists():
-            with replacing(run / name) as temporary:
-                temporary.write_bytes((source / name).read_bytes()[: logs.get(name, 0)])
-
-
-def cut_rows(path: Path, update: int) -> None:
-    """Drops the rows of `update` and later from a log, and damaged rows."""
-    if path.exists():
-        held = read_rows(path, None, whole=False)
-        dated = (row for row in held if isinstance(row.get("update"), int))
-        rows = [row for row in dated if row["update"] < update]
-        with replacing(path) as temporary:
-            temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row]:
+def read_rows(path: Path, length: int | None) -> list[Row]:
     """Reads the rows of a log.
 
     Args:
       path: the log. A missing log has no rows.
       length: bytes to read; None for all.
-      whole: whether a damaged line is an error. If not, it is skipped.
 
     Raises:
       CheckpointError: if the log is damaged.
@@ -281,19 +246,16 @@ def read_rows(path: Path, length: int | None, *, whole: bool = True) -> list[Row
         return []
     with path.open("rb") as file:
         lines = file.read(-1 if length is None else length).splitlines()
-    found = [_parsed(line) for line in lines]
-    if whole and None in found:
-        raise CheckpointError(
-            f"{path} is damaged at line {found.index(None) + 1}: put the file back, or delete it "
-            "to go on without its rows."
-        )
-    return [row for row in found if row is not None]
-
-
-def _parsed(line: bytes) -> Row | None:
-    """Parses a row; None if the line is not a row."""
-    try:
-        row = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return row if isinstance(row, dict) else None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            row = None
+        if not isinstance(row, dict):
+            raise CheckpointError(
+                f"{path} is damaged at line {number}: put the file back, or delete it to go on "
+                "without its rows."
+            )
+        rows.append(row)
+    return rows

@@ -1,19 +1,15 @@
-"""Shows a run while it trains: a live table on a terminal, plain lines elsewhere."""
+"""Shows a run while it trains, as plain lines."""
 
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
-
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
 
 from swarmjax import words
 
 Row = Mapping[str, Any]
 
-LINE_SECONDS = 2.0  # shortest time between two plain lines
+LINE_SECONDS = 2.0  # shortest time between two lines
 
 
 def figures(rows: Sequence[Row], names: Sequence[str], speeds: Row) -> dict[str, str]:
@@ -70,47 +66,29 @@ def _ratio(rows: Sequence[Row], part: str, scale: float = 1.0, unit: str = "") -
 
 
 class Display:
-    """Shows the run on a console. The table of a terminal lives in a `with` block."""
+    """Prints what a run says, line by line."""
 
-    def __init__(self, console: Console | None = None) -> None:
-        """Prepares a display; None: standard output."""
-        self._console = console or Console()
-        self._live = Live(console=self._console, auto_refresh=False)
+    def __init__(self, *, quiet: bool = False) -> None:
+        """Prepares a display; with `quiet` nothing is printed."""
+        self._quiet = quiet
         self._last_line = -LINE_SECONDS
 
     def say(self, sentence: str) -> None:
-        """Prints a sentence above the live table."""
-        self._console.print(sentence, highlight=False, markup=False, soft_wrap=True)
-
-    def working(self, what: str) -> AbstractContextManager[object]:
-        """Shows what is in progress, in a `with` block: moving on a terminal, else as a line."""
-        if not self._console.is_terminal:
-            self.say(f"{what} ...")
-        return self._console.status(what)
+        """Prints a sentence."""
+        if not self._quiet:
+            sys.stdout.write(f"{sentence}\n")
+            sys.stdout.flush()
 
     def show(
         self, texts: Mapping[str, str], update: int, updates: int, seconds_left: float
     ) -> None:
-        """Shows the state of the run."""
+        """Prints the state of the run, at most every `LINE_SECONDS`, and at its end."""
+        if time.monotonic() < self._last_line + LINE_SECONDS and update < updates:
+            return
+        self._last_line = time.monotonic()
         shown = {
             "update": f"{update:,} of {updates:,}",
             **texts,
             "time left": words.duration(seconds_left),
         }
-        if self._console.is_terminal:
-            table = Table(show_header=False)
-            for name, text in shown.items():
-                table.add_row(name, text)
-            self._live.start()  # not earlier: until then, `working` uses the terminal
-            self._live.update(table, refresh=True)
-        elif time.monotonic() >= self._last_line + LINE_SECONDS or update == updates:
-            self._last_line = time.monotonic()
-            self.say("  ".join(f"{name} {text}" for name, text in shown.items()))
-
-    def __enter__(self) -> "Display":
-        """Returns itself. The live table starts with the first call of `show`."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stops the live display and leaves the last table on screen."""
-        self._live.stop()
+        self.say("  ".join(f"{name} {text}" for name, text in shown.items()))

@@ -14,7 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
+import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from swarmjax import provenance
 from swarmjax.config import ConfigError, files, show, to_dict
@@ -42,8 +44,6 @@ def join(settings: TrainConfig) -> None:
     """
     if not settings.run.distributed:
         return
-    import jax
-
     names = {"num_processes": "JAX_NUM_PROCESSES", "process_id": "JAX_PROCESS_ID"}
     try:
         given: dict[str, Any] = {
@@ -68,15 +68,11 @@ def join(settings: TrainConfig) -> None:
 
 def count() -> int:
     """Returns the number of processes of this run."""
-    import jax
-
     return jax.process_count()
 
 
 def is_first() -> bool:
     """Returns whether this process shows and writes the run."""
-    import jax
-
     return jax.process_index() == 0
 
 
@@ -91,8 +87,6 @@ def share(value: int) -> np.ndarray:
     """
     if count() == 1:
         return np.array([value])
-    from jax.experimental import multihost_utils
-
     return np.asarray(multihost_utils.process_allgather(np.int32(value))).reshape(-1)
 
 
@@ -100,8 +94,6 @@ def share_text(text: str) -> str:
     """Returns the text of the first process, on all processes."""
     if count() == 1:
         return text
-    from jax.experimental import multihost_utils
-
     mine = text.encode()
     padded = np.zeros(int(share(len(mine)).max()), np.uint8)
     padded[: len(mine)] = np.frombuffer(mine, np.uint8)
@@ -113,8 +105,6 @@ def gather(tree: Any) -> Any:
     """Gathers, on every process, arrays that are spread over hosts."""
     if count() == 1:
         return tree
-    import jax
-    from jax.experimental import multihost_utils
 
     def whole(x: jax.Array) -> Any:
         if jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -133,8 +123,6 @@ def lost_peers() -> Iterator[None]:
     Raises:
       LostPeerError: if another process is gone.
     """
-    import jax
-
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
@@ -187,17 +175,16 @@ def _check_alike(settings: TrainConfig) -> None:
     theirs = json.loads(share_text(json.dumps(own)))
     if not share(own != theirs).any():
         return
+    differing = [
+        f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0"
+        for key in own
+        if own[key] != theirs.get(key)
+    ]
     other = "another process has other settings or versions"  # than this one, which is process 0
-    for key in own:
-        if own[key] != theirs.get(key):
-            other = f"{key} is {show(own[key])} here and {show(theirs.get(key))} in process 0"
-            break
-    raise ConfigError(f"{other}: give all processes the same.")
+    raise ConfigError(f"{differing[0] if differing else other}: give all processes the same.")
 
 
 def _check_devices(settings: TrainConfig) -> None:
-    import jax
-
     found = jax.device_count()
     if settings.devices != found:
         raise ConfigError(

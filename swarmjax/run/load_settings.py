@@ -22,14 +22,8 @@ _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "exte
 
 # The algo keys that a run with init_from shares with the run that it starts from.
 NETWORK_KEYS = (
-    "policy",
-    "network",
-    "hidden_sizes",
-    "memory",
-    "memory_size",
-    "critic",
-    "activation",
-    "mean_activation",
+    *("policy", "network", "hidden_sizes", "memory", "memory_size"),
+    *("critic", "activation", "mean_activation"),
 )
 
 
@@ -173,21 +167,28 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
             )
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
-    run = kept["run"] | {"stop_after": None, "distributed": False} | given.get("run", {})
-    run["dir"] = given.get("run", {}).get("dir") or given.get("resume")
-    spread = _spread_again(kept["streams"], given.get("devices", kept["devices"]), kept["seeds_by"])
-    return settle(build(TrainConfig, kept | spread | given | {"run": run}))
+    typed = given.get("run", {})
+    here = given.get("resume") or typed.get("dir")
+    if typed.get("dir") and Path(typed["dir"]) != Path(here):
+        raise ConfigError(
+            f"run.dir is {show(typed['dir'])}, but resume is {show(here)}, and a run goes on in "
+            "its own directory: leave run.dir out."
+        )
+    run = kept["run"] | {"stop_after": None, "distributed": False} | typed | {"dir": here}
+    devices = given.get("devices", kept["devices"])
+    streams = _kept_streams(kept["streams"], devices, kept["seeds_by"])
+    return settle(build(TrainConfig, kept | {"streams": streams} | given | {"run": run}))
 
 
 def _may_change(key: str) -> bool:
     return key in _RESUME_KEYS or key.startswith("run.")
 
 
-def _spread_again(streams: int | None, devices: Any, seeds_by: str) -> dict[str, Any]:
-    """Spreads a resumed run over its devices, and keeps its random streams if they fit."""
+def _kept_streams(streams: int | None, devices: Any, seeds_by: str) -> int | None:
+    """Returns the random streams of a resumed run: its own, if its devices can share them."""
     by_seeds = seeds_by == "devices"
     fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
-    return {"devices": devices, "streams": streams if fits else None}
+    return streams if fits else None
 
 
 def load_run(
@@ -202,37 +203,32 @@ def load_run(
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
-    resumed = _by_key(overrides).get("resume", "null").strip("'\"")
+    words = [word for word in overrides if word.startswith("resume=")]
+    resumed = files.parse(TrainConfig, words).get("resume")
     if resumed == AUTO:
-        return _go_on_or_begin(overrides, stages)
-    if resumed in ("", "null"):
+        return _go_on_or_begin([word for word in overrides if word not in words], stages)
+    if not resumed:
         return load_train(overrides, stages=stages)
     return load_resume(read_config(Path(resumed)), overrides)
 
 
-def _by_key(words: Sequence[str]) -> dict[str, str]:
-    """Returns the value of each key as typed; the last one counts."""
-    return {key: value for key, _, value in (word.partition("=") for word in words)}
-
-
-def _go_on_or_begin(
-    overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None
-) -> TrainConfig:
+def _go_on_or_begin(words: Sequence[str], stages: Sequence[dict[str, Any]] | None) -> TrainConfig:
     """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
-    given = _by_key(recipes.expand(TrainConfig, overrides))
-    del given["resume"]
-    begun = [f"{key}={value}" for key, value in given.items()]
-    typed = load_train(begun, stages=stages)
+    typed = load_train(words, stages=stages)
     if typed.run.dir is None:
         raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
     run = Path(typed.run.dir)
     if not (run / CONFIG).exists():
         return typed
-    stored = read_config(run)
-    _check_unchanged(run, to_dict(typed), to_dict(from_stored(stored, "stored ")))
-    changes = [f"{key}={value}" for key, value in given.items() if _may_change(key)]
-    spent = [f"budget={typed.budget}", f"devices={typed.devices}"]
-    return load_resume(stored, [*changes, *spent, f"resume={files.write(str(run))}"])
+    stored = from_stored(read_config(run), "stored ")
+    extension.check_needs(stored.pieces, extension.load(typed.extensions), str(run))
+    _check_unchanged(run, to_dict(typed), to_dict(stored))
+    streams = typed.streams
+    if "streams" not in files.parse(TrainConfig, words):
+        streams = _kept_streams(stored.streams, typed.devices, typed.seeds_by)
+    return replace(
+        typed, resume=str(run), streams=streams, run=replace(typed.run, id=stored.run.id)
+    )
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:

@@ -36,32 +36,25 @@ def limit() -> int | None:
     return None if stats is None else stats.get("bytes_limit")
 
 
-def check(
-    settings: TrainConfig, needed: int, available: int | None, what: str = "training needs"
-) -> None:
+def check(settings: TrainConfig, needed: int) -> None:
     """Refuses a run that does not fit into memory.
 
     Args:
       settings: the run's config.
-      needed: memory for the compiled program, bytes.
-      available: memory of the device, bytes; None if it is unknown, so that nothing is refused.
-      what: what needs the memory, in the message.
+      needed: memory of a device that the run takes, bytes.
 
     Raises:
       ConfigError: if it does not fit. The message names a number of arenas that should fit.
     """
+    available = limit()
     if available is None or needed <= available:
         return
-    advice = _advice(settings, "at most about", MARGIN * settings.arenas * available / needed)
+    fewest = settings.algo.num_minibatches
+    fits = max(int(MARGIN * settings.arenas * available / needed) // fewest, 1) * fewest
     raise ConfigError(
-        f"{_arenas(settings)}, but {what} {_gib(needed)} of memory and there is "
-        f"{_gib(available)}: {advice}."
+        f"arenas is {settings.arenas} and seeds is {settings.seeds}, which needs {_gib(needed)} of "
+        f"memory, and there is {_gib(available)}: give at most about {fits} arenas, or fewer seeds."
     )
-
-
-def check_state(settings: TrainConfig, needed: int, available: int | None) -> None:
-    """Refuses a run whose state alone does not fit, as `check`, before anything is compiled."""
-    check(settings, needed, available, "its state alone needs")
 
 
 @contextlib.contextmanager
@@ -76,26 +69,10 @@ def refusal(settings: TrainConfig) -> Iterator[None]:
     except jax.errors.JaxRuntimeError as error:
         if not any(words in str(error) for words in _EXHAUSTED):
             raise
-        advice = _advice(settings, "about", settings.arenas / 2)
         raise ConfigError(
-            f"{_arenas(settings)}, but the memory of the device is full: {advice}."
+            f"arenas is {settings.arenas}, but the memory of the device is full: give fewer arenas "
+            "or seeds, or a device with more memory."
         ) from None
-
-
-def _advice(settings: TrainConfig, how: str, arenas: float) -> str:
-    """Suggests a number of arenas that can be trained, or another remedy if that does not help."""
-    if settings.resume is not None:  # a resumed run cannot change what its memory depends on
-        return "continue the run on a device with more memory"
-    fewest = settings.algo.num_minibatches
-    if settings.arenas == fewest:
-        return "give fewer seeds, sim.max_robots or algo.rollout_length"
-    return f"give {how} {max(int(arenas) // fewest, 1) * fewest}"
-
-
-def _arenas(settings: TrainConfig) -> str:
-    """States the number of arenas that was given."""
-    each = f" for each of {settings.seeds} seeds" if settings.seeds > 1 else ""
-    return f"arenas is {settings.arenas}{each}"
 
 
 def _gib(amount: float) -> str:

@@ -10,7 +10,6 @@ from swarmjax import epuck, extension, policy_file, provenance
 from swarmjax.config import inherit, to_dict
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import MIN_STD, OBSERVATION_LIMIT
-from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import Leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import observation, pieces
@@ -146,10 +145,7 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
       trained: the run's config.
       update: update of the checkpoint.
       seed: a seed of the run.
-
-    Raises:
-      CheckpointError: if the checkpoint was made with another config.
     """
     lane = trained.numbers.index(seed)
-    arrays = policy_arrays(checkpoint.of_seed(leaves, lane, trained.seeds))
+    arrays = policy_arrays({name: leaf[lane] for name, leaf in leaves.items()})
     policy_file.write(path, _squashed(arrays, trained.algo), policy_meta(trained, update, seed))

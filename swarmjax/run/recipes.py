@@ -25,29 +25,21 @@ def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
     Raises:
       ConfigError: if there is no such recipe, or its file is invalid.
     """
-    others = [word for word in typed if not word.startswith("recipe=")]
-    chosen = files.parse(cls, [word for word in typed if word.startswith("recipe=")]).get("recipe")
-    if not chosen:
-        return others
-    words, chain = others, list[Path]()
-    while chosen:
-        path = files.named_path("recipes", chosen, "recipe")
-        own, chosen = _read(cls, path)
-        if path.resolve() in chain:
-            raise ConfigError(
-                f"{path} extends itself: remove the key recipe from one of the files."
-            )
-        chain.append(path.resolve())
-        words = [*own, *words]
-    return words
+    mine = [word for word in typed if word.startswith("recipe=")]
+    chosen = files.parse(cls, mine).get("recipe")
+    others = [word for word in typed if word not in mine]
+    return [*_read(cls, chosen), *others] if chosen else others
 
 
-def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
-    """Returns the own words of a recipe, and the choice of the recipe that it extends."""
-    found = reading.read_yaml(path)
-    base = found.pop("recipe", None)
-    choices, values = files.read_shared(cls, found, path)
-    words = files.write_words({**choices, **values})
+def _read(cls: type[Section], choice: str, extended_by: Sequence[Path] = ()) -> list[str]:
+    """Returns the words of a recipe, after those of the recipe that it extends."""
+    path = files.named_path("recipes", choice, "recipe")
+    chain = [*extended_by, path.resolve()]
+    if chain[-1] in extended_by:
+        raise ConfigError(f"{path} extends itself: remove the key recipe from one of the files.")
+    settings = reading.read_yaml(path)
+    base = settings.pop("recipe", None)
+    words = files.shared_words(cls, settings, path)
     try:
         files.parse(cls, words)
         if not isinstance(base, str | None):
@@ -56,4 +48,5 @@ def _read(cls: type[Section], path: Path) -> tuple[list[str], str | None]:
             )
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    return words, None if base is None else files.beside(path.parent, base)
+    below = [] if base is None else _read(cls, files.beside(path.parent, base), chain)
+    return [*below, *words]

@@ -2,13 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from swarmjax import provenance
 from swarmjax.policy import PolicyError
 from swarmjax.run import directory
 from swarmjax.run.checkpoint import Leaves
-from swarmjax.run.directory import DECISIONS, METRICS, SUMMARY, Row
+from swarmjax.run.directory import METRICS, SUMMARY
 from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
@@ -38,7 +37,7 @@ def is_current(run: Path, updates: int) -> bool:
 
 
 def write_summary(run: Path, program: Program[TrainConfig], updates: int, compile_s: float) -> None:
-    """Writes `summary.json`, with the totals of the logs.
+    """Writes `summary.json`, with the totals of the run.
 
     Args:
       run: the run directory.
@@ -64,7 +63,6 @@ def write_summary(run: Path, program: Program[TrainConfig], updates: int, compil
             "compile_s": compile_s,
             "arena_steps_per_s": settings.seeds * steps / train_s if train_s else None,
             "transitions_per_s": transitions / train_s if train_s else None,
-            **_by_seed(settings, rows, directory.read_rows(run / DECISIONS, None)),
             "impl": engine.impl,
             "solver": engine.solver,
             "stepped_by": engine.label,
@@ -74,22 +72,3 @@ def write_summary(run: Path, program: Program[TrainConfig], updates: int, compil
             "commit": provenance.commit(),
         },
     )
-
-
-def _by_seed(settings: TrainConfig, rows: list[Row], decisions: list[Row]) -> dict[str, list[Any]]:
-    """Returns the totals of each seed, in the order of the seeds."""
-    transitions = dict.fromkeys(settings.numbers, 0)
-    reached: dict[int, dict[str, float]] = {seed: {} for seed in settings.numbers}
-    for row in rows:
-        transitions[row["seed"]] += row["transitions"]
-    for row in rows[-settings.seeds :]:
-        shares = zip(settings.stage_names, row["success_by_stage"], strict=True)
-        reached[row["seed"]] = {stage: share for stage, share in shares if share is not None}
-    return {
-        "transitions": [*transitions.values()],
-        "targets_reached": [*reached.values()],
-        "decisions": [
-            [entry for entry in decisions if entry["seed"] == seed and "to" in entry]
-            for seed in settings.numbers
-        ],
-    }

@@ -11,15 +11,13 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
-from swarmjax import words
+from swarmjax import outputs, words
 from swarmjax.config import ConfigError, reading, to_dict
 from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.run import (
     checkpoint,
-    compile_cache,
     directory,
     hosts,
     memory,
@@ -48,7 +46,7 @@ from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState
 from swarmjax.training.rollout import Program
 
-CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's refresh interval
+CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's interval
 # There is a checkpoint at least after this share of the budget, so that a short run has some too.
 BUDGET_SHARE = 0.1
 GROWTH = 4  # a call is at most this many times as long as the previous one
@@ -93,7 +91,7 @@ class Run:
         """
         self.settings = settings
         self._stop = stop or Stop()
-        self._display = display or Display(Console(quiet=True))
+        self._display = display or Display(quiet=True)
         self._loggers, self._on_update = loggers, on_update or (lambda row: None)
         self.path, self.update = Path(), 0
         self._kept: Kept | None = None
@@ -114,13 +112,10 @@ class Run:
           StoppedError: if a stop was requested before there was anything to save.
         """
         hosts.join(self.settings)
-        refusal = memory.refusal(self.settings)
-        with compile_cache.use(), hosts.lost_peers(), refusal, self._directory():
+        with hosts.lost_peers(), memory.refusal(self.settings), self._directory():
             self.load()
             if self.update < self.settings.updates:
                 self.compile()
-            if self.settings.run.dry:
-                return
             if not self._is_finished():
                 self._open_files()
                 self._train_chunks()
@@ -132,9 +127,6 @@ class Run:
     def _directory(self) -> Iterator[None]:
         """Makes or opens the run directory, and keeps other processes out of it."""
         weights_and_biases.check(self.settings)
-        if self.settings.run.dry:
-            yield
-            return
         chosen = self._choose_path() if hosts.is_first() else Path()
         claimed = self.settings.run.dir is None
         with hosts.own_directory(chosen) as self.path, directory.locked(self.path, claimed=claimed):
@@ -158,7 +150,7 @@ class Run:
         try:
             return directory.claim(Path("runs"), name)
         except OSError as error:
-            raise directory.unwritable(Path("runs") / name, error) from None
+            raise outputs.unwritable("run.dir", Path("runs") / name, error) from None
 
     def _broken(self, error: OSError | TrainingError) -> TrainingError:
         """Says why the run ends, and what is left of it."""
@@ -173,12 +165,12 @@ class Run:
         self._stop.check()
         settings, self._kept = self.settings, self._read_checkpoint()
         source = warm_start.read(settings) if self._kept is None else None
-        with self._display.working("building the arenas"):
-            self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
-            init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
-            shapes = init.eval_shape(self.schedule)
-            memory.check_state(settings, mesh.bytes_each(settings, shapes), memory.limit())
-            self.state = shapes if settings.run.dry else self._first_state(init, shapes, source)
+        self._display.say("building the arenas ...")
+        self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
+        init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
+        shapes = init.eval_shape(self.schedule)
+        memory.check(settings, mesh.bytes_each(settings, shapes))
+        self.state = self._first_state(init, shapes, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
 
@@ -210,18 +202,16 @@ class Run:
 
     def compile(self) -> None:
         """Compiles the program and claims its memory, so that training cannot run out later."""
-        with self._display.working("compiling"):
-            self._stop.check()
-            compiled = compile_chunk(self.program, self.schedule, self.state)
-            memory.check(self.settings, compiled.total_bytes, memory.limit())
-            began = time.perf_counter()
-            if not self.settings.run.dry:
-                self._claim(compiled)
-            seconds = compiled.seconds + time.perf_counter() - began
-            self.compiled = replace(compiled, seconds=seconds)
-            self._stop.check()
-        for sentence in sentences.compiled(self.compiled, dry=self.settings.run.dry):
-            self._display.say(sentence)
+        self._display.say("compiling ...")
+        self._stop.check()
+        compiled = compile_chunk(self.program, self.schedule, self.state)
+        memory.check(self.settings, compiled.memory_bytes)
+        began = time.perf_counter()
+        self._claim(compiled)
+        seconds = compiled.seconds + time.perf_counter() - began
+        self.compiled = replace(compiled, seconds=seconds)
+        self._stop.check()
+        self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
 
     def _claim(self, compiled: Compiled) -> None:
         """Builds Warp's kernels, and allocates the program's memory."""
@@ -237,17 +227,14 @@ class Run:
         return spent and bool(hosts.share(results.is_current(self.path, self.update))[0])
 
     def _open_files(self) -> None:
-        """Writes `config.json`, and brings the logs of a run that is resumed from elsewhere."""
+        """Writes `config.json`."""
         stored = to_dict(replace(self.settings, resume=None))
         if self.settings.resume is not None:
-            source = Path(self.settings.resume)
-            stored = directory.kept_config(read_config(source), stored)
-            if self._kept is not None:
-                directory.bring(source, self.path, self._kept.logs)
+            stored = directory.kept_config(read_config(Path(self.settings.resume)), stored)
         try:
             directory.write_json(self.path / directory.CONFIG, stored)
         except OSError as error:
-            raise directory.unwritable(self.path, error) from None
+            raise outputs.unwritable("run.dir", self.path, error) from None
 
     def _train_chunks(self) -> None:
         """Trains until the budget is spent, `run.stop_after` is reached or a stop is requested.
@@ -257,11 +244,10 @@ class Run:
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (
-            self._display,  # leaves the last table on screen, before the last sentences
             Recorder(
                 self.path, logs, episodes=options.episodes, loggers=self._make_loggers()
             ) as record,
-            Checkpoints(self.path, options.keep_checkpoints, resumed) as checkpoints,
+            Checkpoints(self.path, resumed) as checkpoints,
         ):
             self._save(checkpoints, record)
             for n in self._chunks():
@@ -371,8 +357,7 @@ class Run:
 
     def _save(self, checkpoints: Checkpoints, record: Recorder) -> None:
         """Begins to write a checkpoint, unless this update is saved already."""
-        about = {"budget": self.settings.budget, "streams": self.settings.stream_count}
-        checkpoints.save(self.state, self.update, record.sync(), of=about)
+        checkpoints.save(self.state, self.update, record.sync())
         self._saved = (time.monotonic(), self.update)
 
     def _write_results(self) -> None:
@@ -390,8 +375,8 @@ class Run:
 
 
 def check_free(run: Path, settings: TrainConfig) -> None:
-    """Refuses a directory that is not empty, unless it holds the run that is resumed."""
-    if settings.resume is not None and Path(settings.resume).resolve() == run.resolve():
+    """Refuses a directory that is not empty, unless a run is resumed there."""
+    if settings.resume is not None:
         return
     held = directory.visible(run)
     if directory.CONFIG in held:

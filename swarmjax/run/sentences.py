@@ -6,7 +6,6 @@ from pathlib import Path
 from swarmjax import command, provenance, words
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import Kept
-from swarmjax.run.compiled import Compiled
 from swarmjax.run.directory import Row
 from swarmjax.run.display import spread
 from swarmjax.run.policy_export import POLICY, seed_path
@@ -42,17 +41,6 @@ def first(
         updates = words.count(source.update, "update")
         yield (
             f"starting with the networks and the normaliser of {settings.init_from} after {updates}"
-        )
-
-
-def compiled(program: Compiled, *, dry: bool) -> Iterator[str]:
-    """Says how long compiling took; in a dry run, also how much memory training needs."""
-    yield f"compiled in {words.duration(program.seconds)}"
-    if dry:
-        state, work = program.state_bytes / 2**20, program.work_bytes / 2**20
-        yield (
-            f"memory: {state:.1f} MiB of state, {work:.1f} MiB to work with; nothing was trained "
-            "(run.dry)."
         )
 
 

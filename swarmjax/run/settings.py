@@ -22,9 +22,6 @@ class RunConfig(Section):
     checkpoint_minutes: float = setting(
         1.0, "minutes between checkpoints; 0: after every chunk", 0.0
     )
-    keep_checkpoints: int = setting(
-        2, "how many of the newest checkpoints to keep, plus the best", 1, MAX_COUNT
-    )
     stop_after: int | None = setting(
         None, "updates after which the run saves and stops", 0, MAX_COUNT
     )
@@ -37,7 +34,6 @@ class RunConfig(Section):
         "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID",
     )
     deterministic: bool = setting(False, "make results on a GPU bit-for-bit repeatable; slower")
-    dry: bool = setting(False, "check and describe the run; train nothing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,19 +44,8 @@ class TrainConfig(ProgramConfig):
     # What is trained. Which code runs, where it is written, what it starts from and who is called
     # is decided by whoever starts the run.
     shared: ClassVar[tuple[str, ...]] = (
-        "stage",
-        "robot",
-        "task",
-        "realism",
-        "algo",
-        "curriculum",
-        "sim",
-        "arenas",
-        "budget",
-        "levels_per_rollout",
-        "seed",
-        "seeds",
-        "streams",
+        *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
+        *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),
     )
 
     # `recipes.expand` replaces this word by the recipe's words, so no config holds it.

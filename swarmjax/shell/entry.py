@@ -26,7 +26,8 @@ def main() -> int:
         hint = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}."
         sys.stderr.write(f"swarmjax: error: {show(name)} is not a command: {hint}\n")
         return USER_ERROR
-    return command.with_outputs("swarmjax", lambda: _print(name))
+    sys.stdout.write((_versions() if name == "--version" else help_text()) + "\n")
+    return 0
 
 
 def _command(name: str, rest: Sequence[str]) -> int:
@@ -35,11 +36,6 @@ def _command(name: str, rest: Sequence[str]) -> int:
     if command.HELP & set(rest):
         return command.run(name, lambda _: 0, settings(name))
     runpy.run_module(f"swarmjax.{name}", run_name="__main__", alter_sys=True)
-    return 0
-
-
-def _print(option: str) -> int:
-    sys.stdout.write((_versions() if option == "--version" else help_text()) + "\n")
     return 0
 
 

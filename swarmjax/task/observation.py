@@ -2,7 +2,7 @@
 
 `INPUTS` is the table of built-in entries. `layout` describes them to other modules. Policy files,
 evaluations, exports and tests take names, units and sizes from `layout`. To add an input, add one
-row to `INPUTS`, its names to `extension.Observation.taken` and, if the input is a new quantity, one
+row to `INPUTS`, its names to `extension.TAKEN` and, if the input is a new quantity, one
 field to `Readings`.
 """
 

@@ -199,7 +199,7 @@ def test_speeds_of_a_run_are_its_steps_by_the_seconds_of_a_call(
     )
     run = Run(program.config, loggers=[logger])
     run.path, run.program, run.schedule = tmp_path / "run", program, schedule
-    run.compiled = Compiled(call, seconds=0.0, state_bytes=0, work_bytes=0)
+    run.compiled = Compiled(call, seconds=0.0, memory_bytes=0)
     run.state = _State(jnp.zeros(SEEDS, jnp.int32))
     run._train_chunks()
     (speeds,) = shown

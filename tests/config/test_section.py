@@ -20,7 +20,7 @@ from swarmjax.sim.config import SimConfig
 from swarmjax.task.config import RewardConfig
 from swarmjax.task.stage_config import StageConfig, smallest_side
 from swarmjax.task.stage_files import load_levels
-from swarmjax.verify import VerifyConfig
+from swarmjax.watch.config import WatchConfig
 
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
 
@@ -121,7 +121,7 @@ def test_what_is_no_number_is_refused(value):
 
 @pytest.mark.parametrize("value", [1, 0, "true", None])
 def test_only_true_and_false_are_booleans(value):
-    assert refusal(build, RunConfig, {"dry": value}, "run.").endswith("give true or false.")
+    assert refusal(build, RunConfig, {"episodes": value}, "run.").endswith("give true or false.")
 
 
 def test_null_only_where_it_is_allowed():
@@ -154,7 +154,7 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
 
 
 def test_a_missing_key_is_named():
-    assert refusal(files.load, VerifyConfig, []) == "run is missing and has no default: give it."
+    assert refusal(files.load, WatchConfig, []) == "run is missing and has no default: give it."
     assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
         "stage.robots is missing and has no default: give it."
     )

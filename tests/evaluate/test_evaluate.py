@@ -206,10 +206,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
     rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.stall=0.01")
     assert _command(monkeypatch, *words, *rules, f"out={out}") == 0
     result = json.loads(out.read_text())
-    assert sorted((path.name for path in out.parent.iterdir()), reverse=True) == [
-        "result.json",
-        ".swarmjax.json",
-    ]
+    assert [path.name for path in out.parent.iterdir()] == ["result.json"]
     assert {key: result[key] for key in ("suite", "engine", "steps", "substeps", "pooled")} == {
         "suite": None,
         "engine": "c",

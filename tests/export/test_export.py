@@ -12,7 +12,7 @@ import pytest
 from policies import saved, saved_for_webots
 from sentences import refusal
 
-from swarmjax import command, outputs, policy_file
+from swarmjax import command, policy_file
 from swarmjax.config import build, to_dict
 from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
@@ -211,24 +211,5 @@ def test_a_folder_is_replaced_only_as_it_was_exported(
     assert first["policy.c"] != second["policy.c"]
     assert {"build/a.o", "thesis.tex"} < second.keys()
     (out / "Makefile").write_bytes(b"changed by hand")
-    said = _refusal(monkeypatch, capsys, *words)
-    assert "Makefile, which swarmjax did not write or which was changed since: give" in said
-    assert (out / "Makefile").read_bytes() == b"changed by hand"
-    assert export.main([*words, "overwrite=true"]) == 0
+    assert export.main(words) == 0
     assert _digests(out) == second
-
-
-def test_a_file_whose_writing_breaks_off_is_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    outputs.write({tmp_path / "a": b"1"})
-
-    def crash(_: int) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("os.fsync", crash)
-    with pytest.raises(KeyboardInterrupt):
-        outputs.write({tmp_path / "a": b"2"})
-    assert {name: (tmp_path / name).read_bytes() for name in directory.visible(tmp_path)} == {
-        "a": b"1"
-    }

@@ -376,7 +376,7 @@ def test_the_folder_says_what_it_is(tmp_path: Path) -> None:
     trained, folder = _exported(tmp_path, f"out={tmp_path / 'swarm-5'}")
     folder = tmp_path / "swarm-5"
     assert {path.name for path in folder.iterdir()} == {
-        "swarm-5.py", "policy.py", "policy.npz", "sensors.json", "README.md", ".swarmjax.json"
+        "swarm-5.py", "policy.py", "policy.npz", "sensors.json", "README.md"
     }  # fmt: skip
     readme = (folder / "README.md").read_text()
     assert "Untested in Webots itself" in readme

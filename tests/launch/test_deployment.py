@@ -179,7 +179,7 @@ def test_the_nodes_of_a_cloud_are_the_processes_of_one_run(tmp_path: Path) -> No
         settings = load_run(words)
         assert (settings.run.distributed, settings.devices) == (True, 2)
         assert _mounted(settings, list(task["file_mounts"]))
-    assert task["resources"]["job_recovery"]["recover_on_exit_codes"] == [75]
+    assert task["resources"]["job_recovery"]["recover_on_exit_codes"] == [75, 134]
     assert task["resources"]["job_recovery"]["max_restarts_on_errors"] == 0
 
 

@@ -149,28 +149,6 @@ def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
         np.testing.assert_allclose(episode.runs[0].pose[0], level.start, atol=1e-6)
 
 
-def test_a_file_that_is_read_is_not_written_over(steer, suite, tmp_path):
-    page, film = tmp_path / "a.html", tmp_path / "a.mp4"
-    for path in (page, film):
-        path.write_bytes(steer.read_bytes())
-    same = f"{tmp_path}/../{tmp_path.name}/a"
-    for words, sentence in {
-        (f"policy={page}", f"out={same}.html"): f"out is {same}.html, which swarmjax did not write",
-        (f"policy={steer},{film}", f"out={tmp_path / 'b.html'}", f"video={film}"): (
-            f"video is {film}, which swarmjax did not write"
-        ),
-        (f"policy={steer}", f"out={steer}"): f"out is {steer}: give a name that ends with .html.",
-        (
-            f"policy={steer}",
-            f"out={tmp_path / 'b.html'}",
-            f"video={page}",
-        ): f"video is {page}: give a name that ends with .mp4.",
-    }.items():
-        assert refusal(replay.main, [*words, *QUICK]).startswith(sentence)
-    for path in (page, film):
-        assert path.read_bytes() == steer.read_bytes()
-
-
 def test_a_page_whose_writing_breaks_off_is_as_it_was(steer, tmp_path, monkeypatch):
     out = tmp_path / "a.html"
     out.write_text("before")
@@ -180,7 +158,7 @@ def test_a_page_whose_writing_breaks_off_is_as_it_was(steer, tmp_path, monkeypat
 
     monkeypatch.setattr("os.fsync", crash)
     with pytest.raises(KeyboardInterrupt):
-        replay.main([f"policy={steer}", *QUICK, f"out={out}", "overwrite=true"])
+        replay.main([f"policy={steer}", *QUICK, f"out={out}"])
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.html": "before"}
 
 

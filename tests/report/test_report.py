@@ -67,7 +67,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
             ["run=good", "runs=good"],
             "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
         ),
-        (["run=good", "step=1"], "step is not a key: give one of run, runs, out, overwrite."),
+        (["run=good", "step=1"], "step is not a key: give one of run, runs, out."),
         (["runs=good,gone"], "runs is 'good,gone', but 'gone' names neither a run nor a "),
         (["runs=good,good"], "seed 0 is in good and in good, which have the same settings: "),
         (["runs=good,,cut"], "runs is 'good,,cut', but '' names neither a run nor a "),

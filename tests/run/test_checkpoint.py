@@ -26,7 +26,7 @@ def _state(value: float) -> dict:
 
 
 def _save(run: Path, *updates: int) -> None:
-    with Checkpoints(run, keep=2) as checkpoints:
+    with Checkpoints(run) as checkpoints:
         for update in updates:
             checkpoints.save(_state(float(update)), update)
 
@@ -98,24 +98,12 @@ def test_another_run_is_refused_with_both_shapes() -> None:
         checkpoint.from_leaves(leaves, jax.eval_shape(lambda: _state(0.0)))
 
 
-@pytest.mark.slow
-def test_a_seed_is_taken_out_of_a_run() -> None:
-    leaves = {"update": np.array([4, 4]), "weights": np.arange(6.0).reshape(2, 3)}
-    mine = checkpoint.of_seed(leaves, 1, seeds=2)
-    assert mine["update"].shape == ()
-    np.testing.assert_array_equal(mine["weights"], [3.0, 4.0, 5.0])
-    with pytest.raises(CheckpointError, match="holds 2 seeds, but the config says 3"):
-        checkpoint.of_seed(leaves, 1, seeds=3)
-    with pytest.raises(CheckpointError, match="holds no axis of seeds, but the config says 1"):
-        checkpoint.of_seed({"update": np.int32(4)}, 0, seeds=1)
-
-
 @pytest.mark.parametrize("sound", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.slow
 def test_going_on_replaces_what_was_damaged(tmp_path: Path, sound: int) -> None:
     _save(tmp_path, sound, 5)
     _flip_one_bit(checkpoint.path_of(tmp_path, 5))
-    with Checkpoints(tmp_path, keep=3, update=sound) as checkpoints:
+    with Checkpoints(tmp_path, update=sound) as checkpoints:
         checkpoints.save(_state(3.0), 3)
         checkpoints.save(_state(5.0), 5)
     assert checkpoint.find(tmp_path)[1:3] == (5, [])
@@ -173,7 +161,7 @@ def test_a_checkpoint_of_another_config_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_bytes_of_the_logs_come_back(tmp_path: Path) -> None:
-    with Checkpoints(tmp_path, keep=1) as checkpoints:
+    with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(_state(1.0), 1, {"metrics.jsonl": 17})
     kept = checkpoint.find(tmp_path)
     assert kept.logs == {"metrics.jsonl": 17}
@@ -181,7 +169,7 @@ def test_the_bytes_of_the_logs_come_back(tmp_path: Path) -> None:
 
 def test_a_state_is_copied_before_the_run_goes_on(tmp_path: Path) -> None:
     state = {"weights": np.zeros((1000, 1000))}
-    with Checkpoints(tmp_path, keep=1) as checkpoints:
+    with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(state, 1)
         state["weights"][:] = 1.0  # as the next call does to a donated state
     assert not checkpoint.find(tmp_path)[0]["weights"].any()
@@ -196,7 +184,7 @@ from swarmjax.run import checkpoint
 state = {f"a{i}": np.random.default_rng(i).random(500) for i in range(40)}
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
 try:
-    with checkpoint.Checkpoints(Path(sys.argv[1]), keep=2) as checkpoints:
+    with checkpoint.Checkpoints(Path(sys.argv[1])) as checkpoints:
         checkpoints.save(state, 0)
 except checkpoint.TrainingError as error:
     print(error)
@@ -220,7 +208,7 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "checkpoints").write_text("a file in the place of the folder")
     with (
         pytest.raises(TrainingError, match="checkpoint 1 cannot be written: ") as error,
-        Checkpoints(tmp_path, keep=1) as checkpoints,
+        Checkpoints(tmp_path) as checkpoints,
     ):
         checkpoints.save(_state(1.0), 1)
     assert "\n" not in str(error.value)
@@ -230,7 +218,7 @@ def test_a_directory_that_was_removed_is_named_and_not_made_again(tmp_path: Path
     run = tmp_path / "run"
     _bind(run, "a")
     named = pytest.raises(TrainingError, match=r"checkpoint 2 .* written: .*run was removed\.")
-    with named, Checkpoints(run, keep=2) as checkpoints:
+    with named, Checkpoints(run) as checkpoints:
         checkpoints.save(_state(1.0), 1)
         checkpoints.wait()
         shutil.rmtree(run)
@@ -256,7 +244,7 @@ def test_an_unfinished_checkpoint_is_not_seen(
     shutil.copytree(tmp_path / "checkpoints", again)
     _save(again.parent, 2)
     assert checkpoint.find(again.parent)[1:3] == (2, [])
-    Checkpoints(tmp_path, keep=2, update=1)
+    Checkpoints(tmp_path, update=1)
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1"]
 
 
@@ -286,7 +274,7 @@ def test_one_bit_of_the_arrays_sends_back_to_the_sound_checkpoint(tmp_path: Path
     _save(tmp_path, 1, 2)
     weights = np.full((2, 3), 2.0, np.float32)
     weights.view(np.uint32)[1, 1] ^= 1
-    with Checkpoints(tmp_path / "changed", keep=1) as checkpoints:
+    with Checkpoints(tmp_path / "changed") as checkpoints:
         checkpoints.save(_state(2.0) | {"weights": jnp.asarray(weights)}, 2)
     folder = checkpoint.path_of(tmp_path, 2)
     shutil.rmtree(folder / "state")

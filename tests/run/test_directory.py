@@ -133,13 +133,6 @@ def test_a_log_is_cut_without_writing_it_again(tmp_path: Path) -> None:
     assert (tmp_path / "log").read_bytes() == lines[:14]
 
 
-def test_rows_are_dropped_by_update_where_no_bytes_are_counted(tmp_path: Path) -> None:
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"update": 0}\n{"why": "x"}\n{"update": 4}\n{"upda')
-    directory.cut_rows(path, 4)
-    assert directory.read_rows(path, None) == [{"update": 0}]
-
-
 def test_what_may_change_is_not_in_the_digest_of_a_config() -> None:
     stored = {"budget": 1, "run": {"dir": "a", "id": "x"}, "algo": {"epochs": 1}, "resume": None}
     now = {"budget": 2, "run": {"dir": "b", "id": "x"}, "algo": {"epochs": 9, "new": 1}}
@@ -147,17 +140,6 @@ def test_what_may_change_is_not_in_the_digest_of_a_config() -> None:
     assert kept == stored | {"budget": 2, "run": {"dir": "b", "id": "x"}}
     assert directory.config_digest(kept) == directory.config_digest(stored)
     assert directory.config_digest(now) != directory.config_digest(stored)
-
-
-def test_logs_are_brought_to_another_directory(tmp_path: Path) -> None:
-    source, run = tmp_path / "source", tmp_path / "run"
-    source.mkdir()
-    run.mkdir()
-    length = _write(source / directory.METRICS, {"update": 0})
-    _write(source / directory.METRICS, {"update": 1})
-    directory.bring(source, run, {directory.METRICS: length})
-    assert directory.read_rows(run / directory.METRICS, None) == [{"update": 0}]
-    assert not (run / directory.DECISIONS).exists()
 
 
 def test_a_file_system_without_locks_is_named(

@@ -1,8 +1,6 @@
 """Checks what a run shows while it trains."""
 
-import io
-
-from rich.console import Console
+import pytest
 
 from swarmjax.run.display import Display, figures, spread
 
@@ -72,29 +70,20 @@ def test_what_no_cohort_has_measured_is_said() -> None:
     assert spread([None, 0.25]) == "25.0 %"
 
 
-def _shown(terminal: bool) -> str:
-    console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
-    with Display(console) as display:
-        display.say("a sentence that stays, however long it may be, " * 4)
-        with display.working("compiling"):
-            pass
-        display.show(figures([ROW], NAMES, SPEEDS), 10, 100, 75.0)
-    file = console.file
-    assert isinstance(file, io.StringIO)
-    return file.getvalue()
+def test_a_run_is_shown_in_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    display = Display()
+    display.say("a sentence")
+    for update in (10, 11, 100):
+        display.show(figures([ROW], NAMES, SPEEDS), update, 100, 75.0)
+    sentence, first, last = capsys.readouterr().out.splitlines()
+    assert sentence == "a sentence"
+    assert first.startswith("update 10 of 100  stage s2  targets reached 25.0 %  ")
+    assert first.endswith("transitions/s 4,321  time left 1 min 15 s")
+    assert last.startswith("update 100 of 100  ")
 
 
-def test_plain_lines_where_there_is_no_terminal() -> None:
-    sentence, working, line = _shown(False).splitlines()
-    assert sentence.count("stays") == 4
-    assert working == "compiling ..."
-    assert line.startswith("update 10 of 100  stage s2  targets reached 25.0 %  ")
-    assert line.endswith("transitions/s 4,321  time left 1 min 15 s")
-    assert "\x1b" not in line
-
-
-def test_a_table_on_a_terminal() -> None:
-    shown = _shown(True)
-    for part in ("transitions/s", "4,321", "1 min 15 s", "10 of 100"):
-        assert part in shown
-    assert "compiling ..." not in shown
+def test_a_quiet_display_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    display = Display(quiet=True)
+    display.say("a sentence")
+    display.show(figures([ROW], NAMES, SPEEDS), 100, 100, 75.0)
+    assert capsys.readouterr().out == ""

@@ -53,7 +53,9 @@ def test_resume_refuses_other_keys(word):
 def test_resume_checks_keys_and_values():
     stored = to_dict(load_train([]))
     assert refusal(load_resume, stored, ["budgt=3"]) == ("budgt is not a key: did you mean budget?")
-    assert refusal(load_resume, stored, ["run.dry=3"]) == "run.dry is 3: give true or false."
+    assert (
+        refusal(load_resume, stored, ["run.episodes=3"]) == "run.episodes is 3: give true or false."
+    )
     assert refusal(load_resume, stored, ["budget=[1"]).startswith(
         "budget is '[1', which cannot be read: "
     )

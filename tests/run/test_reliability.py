@@ -18,7 +18,7 @@ import jax
 import numpy as np
 import pytest
 
-from swarmjax import train, verify
+from swarmjax import train
 from swarmjax.config import ConfigError
 from swarmjax.exit_codes import FAILED, REQUEUE
 from swarmjax.policy import digest
@@ -178,13 +178,6 @@ def test_rows_after_the_checkpoint_are_not_doubled(whole: Path, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_a_run_that_goes_on_elsewhere_has_a_checkpoint_there_at_once(tmp_path: Path) -> None:
-    run, on = _stopped(tmp_path / "run", after=5), tmp_path / "on"
-    assert train.main([f"resume={run}", f"run.dir={on}", "run.stop_after=5"]) == 0
-    assert checkpoint.find(on).update == 5
-
-
-@pytest.mark.slow
 def test_episodes_stay_where_a_run_writes_none_for_a_while(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train.main([*TINY, f"run.dir={run}", "run.episodes=true", "run.stop_after=4"]) == 0
@@ -200,26 +193,6 @@ def test_checkpoints_without_their_config_are_not_added_to(tmp_path: Path) -> No
     (run / "config.json").unlink()
     with pytest.raises(ConfigError, match="which holds checkpoints"):
         train.main([*TINY, f"run.dir={run}"])
-
-
-@pytest.mark.slow
-def test_digests_of_another_budget_are_not_compared(tmp_path: Path) -> None:
-    run = _stopped(tmp_path / "run", after=5)
-    assert train.main([f"resume={run}", "budget=160"]) == 0
-    log = [json.loads(line) for line in (run / "checkpoints.jsonl").read_text().splitlines()]
-    assert {row["budget"] for row in log} == {144, 160}
-    settings = verify.VerifyConfig(run=str(run), updates=9)
-    found = verify.load_digests(settings, load_run([*TINY, "budget=160"]))
-    assert set(found) == {row["update"] for row in log if row["budget"] == 160} & set(range(1, 10))
-
-
-@pytest.mark.slow
-def test_a_run_that_goes_on_elsewhere_takes_its_logs_along(whole: Path, tmp_path: Path) -> None:
-    run = _stopped(tmp_path / "run", after=5)
-    assert train.main([f"resume={run}", f"run.dir={tmp_path / 'on'}"]) == 0
-    assert _updates(tmp_path / "on") == list(range(9))
-    assert _updates(run) == list(range(5))
-    assert _digest(tmp_path / "on") == _digest(whole)
 
 
 @pytest.mark.slow
@@ -373,49 +346,6 @@ def test_a_directory_that_is_removed_while_a_run_trains_is_one_sentence(
     said = capfd.readouterr().err
     assert re.search(rf"error: checkpoint \d cannot be written: {run} was removed\.\n$", said)
     assert said.count("\n") == 1
-
-
-# To train again and compare
-
-
-def test_a_run_verifies(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert verify.main([f"run={whole}", "updates=9"]) == 0
-    assert f"{whole} was reproduced bit for bit, up to update 9" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_run_that_was_trained_otherwise_does_not_verify(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = shutil.copytree(whole, tmp_path / "run")
-    stored = json.loads((run / "config.json").read_text())
-    stored["algo"]["discount"] = 0.5
-    (run / "config.json").write_text(json.dumps(stored))
-    assert verify.main([f"run={run}", "updates=9"]) == FAILED
-    assert "differs from update" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (None, "has no digests in checkpoints.jsonl .* a run that has saved a checkpoint"),
-        ('{"update": 0, "digest": "a"}\n', "has no digests in checkpoints.jsonl"),
-        (
-            '{"update": 2, "digest": "a", "budget": 7}\n',
-            "has no digests in checkpoints.jsonl",
-        ),
-        ('{"update": 7, "digest": "a"}\n', "with updates=3: give more updates"),
-        ("{\n", "checkpoints.jsonl is damaged at line 1"),
-    ],
-)
-def test_what_cannot_be_verified_is_one_sentence(
-    content: str | None, said: str, whole: Path, tmp_path: Path
-) -> None:
-    shutil.copy(whole / "config.json", tmp_path)
-    if content is not None:
-        (tmp_path / "checkpoints.jsonl").write_text(content)
-    with pytest.raises(ValueError, match=said):
-        verify.main([f"run={tmp_path}", "updates=3"])
 
 
 # Numbers that are not finite

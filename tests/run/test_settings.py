@@ -281,7 +281,7 @@ def test_train_refuses(words, sentence):
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
         (["algo=ppo"], "algo is not a key: give one of stage, robot, task, suite, shape, realism, "
-         "action, steps, episodes, seed, workers, substeps, extensions, overwrite, policy, "
+         "action, steps, episodes, seed, workers, substeps, extensions, policy, "
          "compare, engine, out."),
     ],
 )  # fmt: skip

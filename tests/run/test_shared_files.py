@@ -143,9 +143,10 @@ def test_a_run_with_an_extension_asks_for_it(tmp_path: Path) -> None:
     trained = load_train([f"extensions={path}"])
     stored = to_dict(trained)
     assert "mine.py" not in json.dumps(stored)
+    digest = trained.pieces["reward"]["brave"]
     assert refusal(load_resume, stored, []) == (
-        "the stored run was trained with the reward brave, which is not part of swarmjax: give "
-        "extensions=FILE, the file that defines it."
+        f"the stored run was trained with the reward brave of digest {digest[:12]}, but extensions "
+        "holds no such piece: give extensions=FILE, the file of its training."
     )
     assert settle(load_resume(stored, [f"extensions={path}"])).extensions == str(path)
 

@@ -101,7 +101,6 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
     assert summary["budget_spent"] is True
     assert (summary["impl"], summary["update_backend"]) == ("jax", "autodiff")
     assert summary["seeds"] == [0]
-    assert summary["transitions"] == [sum(row["transitions"] for row in rows)]
     stored = json.loads((whole / "config.json").read_text())
     assert build(TrainConfig, stored).algo.hidden_sizes == (8,)
 
@@ -136,10 +135,6 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(whole: Path, tmp_pat
     assert train.main([f"resume={tmp_path}"]) == 0
     assert _digest(tmp_path) == _digest(whole)
     assert _rows(tmp_path) == _rows(whole)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    kept = json.loads((whole / "summary.json").read_text())
-    for name in ("arena_steps", "transitions", "targets_reached", "decisions"):
-        assert summary[name] == kept[name], name
 
 
 @pytest.fixture
@@ -190,15 +185,6 @@ def test_a_summary_of_a_smaller_budget_is_written_anew(
     assert json.loads((copied / "summary.json").read_text())["updates"] == 9
 
 
-def test_a_run_that_is_done_can_be_written_elsewhere(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _forbid_compiling(monkeypatch)
-    assert train.main([f"resume={whole}", f"run.dir={tmp_path}"]) == 0
-    assert _digest(tmp_path) == _digest(whole)
-    assert {"config.json", "policy.npz", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
-
-
 @pytest.fixture(scope="module")
 def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Returns a run of seeds 3 and 4 on two stages; the first stage ends by its budget."""
@@ -224,30 +210,20 @@ def test_several_seeds_leave_what_each_of_them_came_to(several: Path) -> None:
     assert not (several / "policy.npz").exists()
 
 
-def test_the_summary_of_several_seeds_has_a_list_for_each_figure(several: Path) -> None:
+def test_the_summary_of_several_seeds_counts_all_of_them(several: Path) -> None:
     rows, summary = _rows(several), json.loads((several / "summary.json").read_text())
     assert summary["seeds"] == [3, 4]
     assert summary["arena_steps"] == 4 * 4 * 9  # of each seed
-    transitions = [
-        sum(row["transitions"] for row in rows if row["seed"] == seed) for seed in (3, 4)
-    ]
-    assert summary["transitions"] == transitions
-    assert summary["transitions_per_s"] == pytest.approx(sum(transitions) / summary["train_s"])
+    transitions = sum(row["transitions"] for row in rows)
+    assert summary["transitions_per_s"] == pytest.approx(transitions / summary["train_s"])
     steps = 2 * 4 * 4 * 9
     assert summary["arena_steps_per_s"] == pytest.approx(steps / summary["train_s"])
-    for seed, decisions, reached in zip(
-        (3, 4), summary["decisions"], summary["targets_reached"], strict=True
-    ):
-        # The first stage gets half of nine updates, so it ends after the fifth.
-        moves = [
-            (entry["update"], entry["seed"], entry["from"], entry["to"]) for entry in decisions
-        ]
-        assert moves == [(4, seed, "s1", "s2")]
-        last = [row for row in rows if row["seed"] == seed][-1]
-        assert [reached.get(name) for name in ("s1", "s2")] == last["success_by_stage"]
-    lines = (several / "curriculum.jsonl").read_text().splitlines()
-    logged = [entry for decisions in summary["decisions"] for entry in decisions]
-    assert [json.loads(line) for line in lines] == logged
+    lines = map(json.loads, (several / "curriculum.jsonl").read_text().splitlines())
+    # The first stage gets half of nine updates, so it ends after the fifth.
+    assert [(each["update"], each["seed"], each["from"], each["to"]) for each in lines] == [
+        (4, 3, "s1", "s2"),
+        (4, 4, "s1", "s2"),
+    ]
 
 
 @pytest.mark.slow
@@ -352,7 +328,7 @@ def test_a_resumed_run_spares_other_runs_and_what_is_spent(
     capsys.readouterr()
     before = (other / "config.json").read_bytes()
     sentence = _refusal(capsys, "train", f"resume={whole}", f"run.dir={other}")
-    assert "holds a run already" in sentence
+    assert "a run goes on in its own directory: leave run.dir out" in sentence
     assert (other / "config.json").read_bytes() == before
     sentence = _refusal(capsys, "train", f"resume={whole}", f"budget={4 * 4 * 5}")
     assert f"has spent {4 * 4 * 9} already" in sentence
@@ -418,15 +394,6 @@ def test_bad_input_is_one_sentence(
     sentence = _refusal(capsys, "train", *small, *words)
     for part in parts:
         assert part in sentence
-
-
-def test_a_dry_run_compiles_and_leaves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    assert _train(f"run.dir={run}", "run.dry=true") == 0
-    assert "MiB of state" in capsys.readouterr().out
-    assert not run.exists()
 
 
 @pytest.mark.slow

@@ -158,7 +158,7 @@ def pair(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run.mkdir()
     stored = read_config(trained) | {"seeds": 2}
     (run / "config.json").write_text(json.dumps(stored))
-    with Checkpoints(run, keep=1) as checkpoints:
+    with Checkpoints(run) as checkpoints:
         checkpoints.save(lanes, UPDATES)
     return run
 
@@ -277,7 +277,7 @@ def test_other_networks_are_refused(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sentence = _refusal(capsys, monkeypatch, *TINY, *words, f"init_from={trained}", "run.dry=true")
+    sentence = _refusal(capsys, monkeypatch, *TINY, *words, f"init_from={trained}")
     assert sentence == f"init_from is '{trained}', whose {what}, or another run."
 
 
@@ -367,7 +367,7 @@ def test_keys_that_do_not_fit_together_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = [word.format(trained) for word in words]
-    assert _refusal(capsys, monkeypatch, *words, "run.dry=true") == sentence
+    assert _refusal(capsys, monkeypatch, *words) == sentence
 
 
 def test_robot_task_realism_and_network_are_those_of_the_source(tmp_path: Path) -> None:

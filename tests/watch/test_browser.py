@@ -31,7 +31,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
     run = write(tmp_path_factory.mktemp("runs") / HOSTILE, rows, trained=TRAINED)
     begun = Run(TRAINED)
     begun.load()
-    with Checkpoints(run, keep=1) as checkpoints:
+    with Checkpoints(run) as checkpoints:
         checkpoints.save(begun.state, 0)
     made = Views(WatchConfig(run=str(run)))
     made.draw()

@@ -256,7 +256,7 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     views.draw()
     with pytest.raises(
         ConfigError,
-        match=r"^the stored run .* the reward mine,",
+        match=r"^the stored run .* the reward mine of",
     ):
         newest.record(views.settings, views.history)
     assert not mark.exists()
