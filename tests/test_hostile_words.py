@@ -23,7 +23,6 @@ SOUND = {
     "swarmjax.report": ["run=a"],
     "swarmjax.replay": ["policy=a.npz"],
     "swarmjax.reproduce": [],
-    "swarmjax.suite": ["suite=dev"],
     "swarmjax.verify": ["run=a"],
     "swarmjax.watch": ["run=a"],
 }

@@ -40,7 +40,7 @@ class CellConfig(Section):
         None, "of the robots; null: the command's", 0.0, MOST_HULL_FRICTION
     )
     shape: Shape = setting("box", "of the obstacles")
-    digest: str | None = setting(None, "SHA-256 of the levels; null: not drawn yet")
+    digest: str | None = setting(None, "SHA-256 of the levels; null: not checked")
 
     def _check(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):

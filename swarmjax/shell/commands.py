@@ -30,7 +30,6 @@ COMMANDS: dict[str, Command] = {
     "reproduce": Command(
         "swarmjax.reproduce.config:ReproduceConfig", "Repeat the study of the paper."
     ),
-    "suite": Command("swarmjax.suite:SuiteConfig", "Draw the levels that policies are judged on."),
     "verify": Command("swarmjax.verify:VerifyConfig", "Train a run again and compare it."),
     "watch": Command("swarmjax.watch.config:WatchConfig", "Follow a run on a page."),
 }
