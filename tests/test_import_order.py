@@ -28,7 +28,7 @@ ROOMS = {
     "adapters": {"environment"},
     "reproduce": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
     "shell": SHARED,
-    "watch": SHARED | {"task", "run", "evaluate", "pages", "report", "replay"},
+    "watch": SHARED | {"run", "pages", "report"},
 }
 # `ALSO` lists files that may import more than their room. The judge on the device uses the training
 # code, and the cache of compiled programs belongs to `run`.
