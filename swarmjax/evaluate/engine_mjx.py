@@ -93,7 +93,7 @@ def play(
       sampled: whether to draw the actions from the policy; otherwise they are its means.
 
     Returns:
-      [E] outcomes, as NumPy arrays; impulses are nan, since contacts are analytic here.
+      [E] outcomes, as NumPy arrays.
 
     Raises:
       ConfigError: the physics of an episode breaks down.
@@ -278,6 +278,5 @@ def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
         arrived=after.arrived,
         begins=after.episode.contacts - before.episode.contacts,
         touches=after.apart == 0.0,
-        impulse=jnp.nan,
         sensed=after.episode.sensed > before.episode.sensed,
     )

@@ -161,13 +161,13 @@ def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
             f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
             "extension that only npz supports: give format=npz, or train with algo.network=mlp."
         )
-    if form != "webots":
-        return
     if "neighbours" in meta["observation"]:
         raise PolicyError(
-            "format is webots, but the policy observes neighbours, and the controller has no "
-            "board for range and bearing: give format=c or onnx, and your own controller."
+            f"format is {form}, but the policy observes neighbours, which only npz supports: give "
+            "format=npz, or train with task.neighbours.count=0."
         )
+    if form != "webots":
+        return
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from swarmjax.policy import FORMAT, PolicyError
-from swarmjax.policy_file.reach import check_reach
 
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
@@ -180,7 +179,6 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     _check_observation(meta)
     _check_action(meta["action"])
     _check_arrays(arrays, meta)
-    check_reach(arrays, _hidden_layers(arrays, meta), meta, _neighbours(meta))
 
 
 def _value(meta: Mapping[str, Any], field: str) -> Any:

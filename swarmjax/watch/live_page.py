@@ -3,6 +3,7 @@
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 from swarmjax import command
 from swarmjax.config import ConfigError
@@ -48,23 +49,13 @@ class LivePage:
         with self._lock:
             self._draw()
             state, sentence = status.read(self.run, self.trained, self.history)
-            about = {"state": state, "sentence": sentence, "trouble": self.trouble}
+            about: dict[str, Any] = {"state": state, "sentence": sentence, "trouble": self.trouble}
+            about |= {"styles": _STYLES, "has_trained": self.history is not None}
             title = f"Watching {self.run}"
             if self.history is None:
-                return builder.render(
-                    _TEMPLATE, styles=_STYLES, title=title, has_trained=False, **about
-                )
+                return builder.render(_TEMPLATE, title=title, **about)
             made_by = command.line("watch", f"run={self.run}")
-            return report_page.page(
-                title,
-                made_by,
-                self.history,
-                self.figures,
-                _TEMPLATE,
-                _STYLES,
-                has_trained=True,
-                **about,
-            )
+            return report_page.page(title, made_by, self.history, self.figures, _TEMPLATE, **about)
 
     def _draw(self) -> None:
         """Draws the figures if the run has logged more, unless drawing must rest."""
