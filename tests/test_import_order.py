@@ -33,7 +33,7 @@ ROOMS = {
 # `ALSO` lists files that may import more than their room. The judge on the device uses the training
 # code, and the cache of compiled programs belongs to `run`.
 ALSO = {
-    "evaluate/engine_mjx.py": {"policy_network", "ppo", "training"},
+    "evaluate/engine_mjx.py": {"policy_network", "training"},
     "evaluate/trials.py": {"run"},
 }
 # Shared modules import no room except `config`. policy.py, which users copy, imports nothing.
