@@ -107,15 +107,6 @@ def load(config: EvaluateConfig) -> Suite:
     return draw(config.suite)
 
 
-def stages(config: EvaluateConfig) -> list[StageConfig]:
-    """Lists the stages of an evaluation before drawing levels; none for a file of levels."""
-    if config.suite is None:
-        return [config.stage]
-    if Path(config.suite).suffix == ".npz":
-        return []
-    return [cell.stage for cell in read_suite(config.suite).cells]
-
-
 def draw(choice: str) -> Suite:
     """Draws the levels of a suite and checks the digests in its file.
 

@@ -271,7 +271,6 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
         (_text("name: a, stage: s1, seed: 5"), "seed is 5: give 1000000 to 2147483647."),
         (_text("name: a, stage: s1, seed: 1000000, shape: ball"), "shape is 'ball': give box, "),
         (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1]"), "levels is 2, but"),
-        (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1, 1]"), "episodes holds"),
         (_text("name: a b, stage: s1, seed: 1000000"), "name is 'a b': give letters, digits"),
         (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells names a more than once"),
         (_text("name: a, stage: {robots: 2, side: 0.3}, seed: 1000000"), "stage.side is 0.3: "),
