@@ -140,7 +140,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
         return
     # Refuses numbers that the archive's reader leaves unchecked.
     trained_settings.trained(meta, str(source))
-    _check_form(meta, settings.format, settings.sensors)
+    _check_form(meta, settings.format)
     trained = policy_file.read(source)
     if settings.format == "onnx":
         outputs.write({out: onnx.render(trained)})
@@ -148,13 +148,13 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     if settings.format == "c":
         made = c.render(trained)
     else:
-        made = webots.render(trained, content, settings.sensors, out.name)
+        made = webots.render(trained, content, out.name)
     inside = {out / name: each for name, each in made.items()}
     outputs.check("out", inside, overwrite=settings.overwrite)
     outputs.write(inside)
 
 
-def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
+def _check_form(meta: Mapping[str, Any], form: str) -> None:
     """Checks that a form can hold a policy, and that its controller can measure all inputs."""
     if "network" in meta:
         raise PolicyError(
@@ -175,16 +175,16 @@ def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
             f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
             "cannot measure: give format=c or onnx, and your own controller."
         )
-    _check_range(meta, sensors)
+    _check_range(meta)
 
 
-def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
+def _check_range(meta: Mapping[str, Any]) -> None:
     """Checks that the policy's infrared reaches no further than the sensors measure distances."""
-    reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
+    reach, farthest = meta["sensors"]["range"], response.REACH["webots"]
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(
             f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
-            f"sensors={sensors} measure distances only to {farthest:g} m: train with "
+            f"Webots' sensors measure distances only to {farthest:g} m: train with "
             f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
         )
 
