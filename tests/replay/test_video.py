@@ -106,8 +106,6 @@ except ConfigError:
 video.HEIGHT, video.HOLD = 240, 0.1
 run = replays.wandering(2, 4)
 run.pose[:, :, :2] = run.scene.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
-run.ray[:], run.touching[:] = 0.04, False
-run.touching[:, 1] = True
 settings = load_levels(ReplayConfig, ["policy=a", "task.control_step=0.064"])
 out = Path(sys.argv[1])
 video.write(out, settings, [replays.episode(run, run)])
@@ -140,11 +138,6 @@ def test_a_film_shows_the_robots(tmp_path):
     assert count == 6 + 3
     assert picture.shape == (240, 2 * 320, 3)
     for half in (picture[:, :320], picture[:, 320:]):
-        red = (half[..., 0] > 120) & (half[..., 1:].max(axis=-1) < 80)
-        rows, columns = np.nonzero(red)  # the ring of robot 1, upper right
-        assert len(rows) > 10
-        assert rows.mean() < 120
-        assert columns.mean() > 160
         blue = (half[..., 2] > 100) & (half[..., 2] > 2 * half[..., 0])
         rows, columns = np.nonzero(blue)  # robot 0, lower left
         assert len(rows) > 50
