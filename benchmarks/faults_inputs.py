@@ -27,6 +27,7 @@ from swarmjax.config.section import Section
 from swarmjax.evaluate import cells, trained_settings, trials
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import list_files
+from swarmjax.evaluate.suite_config import read_suite
 from swarmjax.export.config import ExportConfig
 from swarmjax.policy import PolicyError
 from swarmjax.policy_file import read_meta
@@ -65,9 +66,10 @@ def _evaluate(words: Words) -> None:
     for text in (settings.policy, settings.compare):
         if text is not None:
             trials.read_policies(list_files("policy", text), settings.extensions)
-    cells.stages(settings)
     if (settings.suite or "").endswith(".npz"):
         cells.read(Path(settings.suite or ""))
+    elif settings.suite is not None:
+        read_suite(settings.suite)
 
 
 def _replay(words: Words) -> None:

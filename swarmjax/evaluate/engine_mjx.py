@@ -126,8 +126,17 @@ def _program(
     """
     meta = json.loads(about)
     layout, (speed, turn_rate) = meta["observation"], meta["action"]["high"][:2]
+    weights: dict[str, Any] = dict.fromkeys(_WEIGHTS)  # given when the program runs
     shared = meta["policy"] == "shared"
-    bare = Policy(*[None] * 4, shared, layout["encoding"], speed, turn_rate, meta, "")
+    bare = Policy(
+        **weights,
+        is_shared=shared,
+        encoding=layout["encoding"],
+        max_speed=speed,
+        max_turn_rate=turn_rate,
+        meta=meta,
+        digest="",
+    )
     heard = judge.neighbours(bare)
     mine = replace(
         world,

@@ -73,14 +73,14 @@ def render(policy: Policy) -> bytes:
     gives = {"action": actions, "command": actions}
     if policy.carried:
         takes, gives = takes | {"memory": policy.carried}, gives | {"memory_after": policy.carried}
-    ports = [
+    inputs, outputs = (
         [
             helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
             for name, size in sizes.items()
         ]
         for sizes in (takes, gives)
-    ]
-    made = helper.make_graph(graph.nodes, "policy", *ports, graph.constants)
+    )
+    made = helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.constants)
     operators = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(
         made, producer_name="swarmjax", ir_version=IR_VERSION, opset_imports=operators
