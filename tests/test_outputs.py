@@ -9,7 +9,7 @@ import pytest
 from runs import row, write
 from sentences import refusal
 
-from swarmjax import outputs, suite
+from swarmjax import outputs
 from swarmjax.evaluate import __main__ as evaluate
 from swarmjax.export import __main__ as export
 from swarmjax.replay import __main__ as replay
@@ -17,7 +17,6 @@ from swarmjax.report import __main__ as report
 from swarmjax.reproduce import __main__ as reproduce
 
 Main = Callable[[Sequence[str]], int]
-SUITE = "cells:\n- {name: one, stage: s1, levels: 2, seed: 1000001}\n"
 # For each command: its words, the key of its output, the output, and the file that would be lost.
 COMMANDS: dict[str, tuple[Main, list[str], str, str]] = {
     "evaluate folder": (
@@ -39,7 +38,6 @@ COMMANDS: dict[str, tuple[Main, list[str], str, str]] = {
         "page.html",
     ),
     "report": (report.main, ["run=run", "out=told"], "out", "told/report.html"),
-    "suite": (suite.main, ["suite=mine.yaml", "out=levels.npz"], "out", "levels.npz"),
     "export npz": (export.main, ["policy=policy.npz", "out=b.npz"], "out", "b.npz"),
     "export onnx": (export.main, ["policy=policy.npz", "format=onnx"], "out", "policy.onnx"),
 }
@@ -47,11 +45,9 @@ COMMANDS: dict[str, tuple[Main, list[str], str, str]] = {
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder, with a policy, a suite and a run."""
+    """The working folder, with a policy and a run."""
     monkeypatch.chdir(tmp_path)
     policies.saved(Path("policy.npz"))
-    Path("mine.yaml").write_text(SUITE)
-    suite.main(["suite=mine.yaml", "write=true"])
     write(Path("run"), [row(0)])
     return tmp_path
 
@@ -73,7 +69,7 @@ def test_a_file_of_the_user_is_refused_before_the_work(
     assert Path(lost).read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["evaluate folder", "replay", "report", "suite", "export npz"])
+@pytest.mark.parametrize("name", ["evaluate folder", "replay", "report", "export npz"])
 @pytest.mark.usefixtures("folder")
 def test_a_command_replaces_its_own_output_and_on_request_any_file(name: str) -> None:
     main, words, _, written = COMMANDS[name]
@@ -82,13 +78,6 @@ def test_a_command_replaces_its_own_output_and_on_request_any_file(name: str) ->
     assert main([*words, "overwrite=true"]) == 0
     assert Path(written).read_bytes() != b"mine"
     assert main(words) == 0
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_suite_does_not_replace_a_policy() -> None:
-    before = Path("policy.npz").read_bytes()
-    assert "out is policy.npz" in refusal(suite.main, ["suite=mine.yaml", "out=policy.npz"])
-    assert Path("policy.npz").read_bytes() == before
 
 
 @pytest.mark.usefixtures("folder")
