@@ -17,7 +17,6 @@ Examples:
   python -m swarmjax.export policy=policy.npz format=webots
 """
 
-import re
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -91,8 +90,6 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
         raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
-    if settings.format == "webots":
-        _check_controller(out)
     return out
 
 
@@ -111,15 +108,6 @@ def _default(settings: ExportConfig) -> str:
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
     )
-
-
-def _check_controller(out: Path) -> None:
-    """Checks that a folder's name can be the name of a controller's module."""
-    if not re.fullmatch(r"[A-Za-z_][\w-]*", out.name, re.ASCII):
-        raise ConfigError(
-            f"out is {out}, whose name is also the controller's: give letters, digits, _ and - "
-            "only, as in swarmjax_epuck."
-        )
 
 
 def convert(settings: ExportConfig, source: Path, out: Path) -> None:

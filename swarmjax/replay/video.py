@@ -5,7 +5,6 @@ true sizes. Targets are discs of their radius on the floor.
 """
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -44,19 +43,13 @@ def check() -> None:
         import imageio_ffmpeg
 
         imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError):
-        raise ConfigError(
-            "video needs imageio and its ffmpeg, which are not installed: "
-            "install the extra, as in uv sync --extra video."
-        ) from None
-    try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW warns about what the error below explains
             mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
-    except Exception:  # each platform's library raises its own errors
+    except Exception as error:  # each platform's library raises its own errors
         raise ConfigError(
-            f"video needs OpenGL, but MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not work on "
-            "this machine: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
+            f"video cannot be made here ({type(error).__name__}): install the extra, as in uv sync "
+            "--extra video, and set MUJOCO_GL=egl (Debian's libegl1) or osmesa (libosmesa6)."
         ) from None
 
 
