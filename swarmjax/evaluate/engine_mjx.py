@@ -33,7 +33,6 @@ from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
-LARGEST_BOX = 0.3  # m; largest size of a box that a stage allows
 _ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
 _WEIGHTS = ("layers", "log_std", "mean", "std", "memory", "hearing")
 
@@ -50,7 +49,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
       The world, still without a policy's limits and encoding.
 
     Raises:
-      ConfigError: a box is larger than the engine supports.
+      ConfigError: a box is larger than a stage allows.
     """
     fits = half.max(initial=0.0) <= task_stage.largest_half([config.stage])
     stage = config.stage if fits else _largest(config.stage, half)
@@ -71,11 +70,6 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
     """Returns a stage with the same robot count and box size; the program needs only these."""
     largest = 2.0 * float(half.max(initial=0.05))  # without boxes any size will do
-    if largest > LARGEST_BOX:
-        raise ConfigError(
-            f"stage {stage.name}: a box is {largest:g} m long, but engine=mjx takes up to "
-            f"{LARGEST_BOX:g} m: give engine=c."
-        )
     return StageConfig(name=stage.name, robots=stage.robots, side=4.0, obstacle_size=largest)
 
 

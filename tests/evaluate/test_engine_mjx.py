@@ -112,7 +112,7 @@ def test_the_engines_agree_on_a_policy_that_remembers(tmp_path: Path) -> None:
 def test_boxes_beyond_what_the_engine_is_compiled_for_are_refused() -> None:
     config = EvaluateConfig(policy="p", stage=STAGES[0], engine="mjx")
     sentence = refusal(engine_mjx.load, config, np.array([[0.2, 0.05]]), 2)
-    assert sentence.startswith("stage s1: a box is 0.4 m long, but engine=mjx takes up to 0.3 m")
+    assert sentence.startswith("obstacle_size is 0.4: give ")
 
 
 def test_an_engine_that_breaks_down_is_reported(tmp_path: Path) -> None:
