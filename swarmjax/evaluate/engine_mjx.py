@@ -121,10 +121,9 @@ def _program(
     meta = json.loads(about)
     layout, (speed, turn_rate) = meta["observation"], meta["action"]["high"][:2]
     weights: dict[str, Any] = dict.fromkeys(_WEIGHTS)  # given when the program runs
-    shared = meta["policy"] == "shared"
     bare = Policy(
         **weights,
-        is_shared=shared,
+        is_shared=meta["policy"] == "shared",
         encoding=layout["encoding"],
         max_speed=speed,
         max_turn_rate=turn_rate,
@@ -151,10 +150,10 @@ def _program(
             shape = (arenas.observation.shape[-2], len(meta["action"]["names"]))
             seed, clock = arenas.level.seed, arenas.clock
             normal = noise.normal(seed, clock, Stream.ACTION, shape, jnp) if sampled else 0.0
-            return policy.step(trained, memory, arenas.observation, normal, jnp)
+            with jax.default_matmul_precision("highest"):  # as NumPy computes
+                return policy.step(trained, memory, arenas.observation, normal, jnp)
 
-        with jax.default_matmul_precision("highest"):
-            return run(mine, act, levels, steps, memory)[1:]
+        return run(mine, act, levels, steps, memory)[1:]
 
     return play
 
