@@ -78,7 +78,6 @@ COMMANDS = {
     "replay": ["swarmjax", "replay", "policy=runs/a/policy.npz", "level=0,1"],
     "report": ["swarmjax", "report", "run=runs/a"],
     "export": ["swarmjax", "export", "policy=runs/a/policy.npz", "format=c", "out=c"],
-    "suite": ["swarmjax", "suite", "suite=expanded"],
     "reproduce": ["swarmjax", "reproduce", "--help"],
     "Python": ["python", "-c", PYTHON_CALLS],
     "types": ["pyright", "--pythonpath", "python", "typed.py"],

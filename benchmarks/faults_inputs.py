@@ -37,7 +37,6 @@ from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.suite import SuiteConfig
 
 # Seconds of processor time until a refusal; a wall clock would also count the machine's other work.
 MOST_SECONDS = 10.0
@@ -67,9 +66,10 @@ def _evaluate(words: Words) -> None:
     for text in (settings.policy, settings.compare):
         if text is not None:
             trials.read_policies(list_files("policy", text), settings.extensions)
-    cells.stages(settings)
     if (settings.suite or "").endswith(".npz"):
         cells.read(Path(settings.suite or ""))
+    elif settings.suite is not None:
+        read_suite(settings.suite)
 
 
 def _replay(words: Words) -> None:
@@ -91,10 +91,6 @@ def _report(words: Words) -> None:
         rows.read(Path(settings.run or ""))
 
 
-def _suite(words: Words) -> None:
-    read_suite(files.load(SuiteConfig, words).suite)
-
-
 def _reproduce(words: Words) -> None:
     files.load(ReproduceConfig, words)
 
@@ -105,7 +101,6 @@ LOADERS: dict[str, tuple[Callable[[Words], None], type[Section]]] = {
     "replay": (_replay, ReplayConfig),
     "export": (_export, ExportConfig),
     "report": (_report, ReportConfig),
-    "suite": (_suite, SuiteConfig),
     "reproduce": (_reproduce, ReproduceConfig),
 }
 # Valid command lines to mutate; `_write_files` writes their files.
@@ -119,7 +114,6 @@ _SOUND: dict[str, list[str]] = {
     "replay": ["policy=policy.npz", "policy=policy.npz suite=suite.yaml worst=1", "policy=b.npz"],
     "export": ["policy=policy.npz out=b.npz", "policy=policy.npz format=c", "run=run"],
     "report": ["run=run", "runs=run", "run=run out=there"],
-    "suite": ["suite=suite.yaml", "suite=dev"],
     "reproduce": ["seeds=3 budget=6000 fine_tune=6000", "arms=[baseline] minutes=1", "resume=run"],
 }
 # Words that are appended to give a process very little work; the last word for a key counts.
@@ -127,7 +121,6 @@ _TINY: dict[str, list[str]] = {
     "train": ["run.stop_after=1", "arenas=8", "algo.rollout_length=2", "task.step_limit=4"],
     "evaluate": ["episodes=1", "steps=2", "workers=1"],
     "replay": ["steps=2", "episodes=1", "workers=1"],
-    "suite": [],
     "reproduce": ["minutes=0.0001"],
     "export": [],
     "report": [],

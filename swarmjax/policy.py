@@ -17,11 +17,6 @@ _MAX_LIST = 2**16  # bytes of the list of members; a name takes a hundred
 MAX_LETTERS = 2**20  # characters of `meta`, four bytes each
 MAX_ENTRIES = 2**16  # entries of `meta`, each a hundred bytes or more
 MEMORY = ("input/kernel", "input/bias", "recurrent/kernel", "recurrent/bias")
-_ACTIVATIONS = {
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0),
-    "swish": lambda x: 0.5 * x * (1 + np.tanh(0.5 * x)),  # x * logistic(x), without overflow
-}
 
 
 class PolicyError(ValueError):
@@ -122,20 +117,15 @@ def assemble(
     )
 
 
-def open_archive(file: IO[bytes]) -> zipfile.ZipFile:
-    """Opens an archive; first checks the size of its list of members, which zipfile reads."""
+def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
+    """Reads the arrays of an archive; refuses one that unpacks to more bytes than it has."""
     file.seek(max(0, file.seek(0, 2) - 42))
     end = file.read()
     if end[-22:-18] != b"PK\5\6":
         raise zipfile.BadZipFile("File is not a zip file")
     if end[:4] == b"PK\6\7" or int.from_bytes(end[-10:-6], "little") > _MAX_LIST:
         raise ValueError(f"its list of members has more than {_MAX_LIST} bytes")
-    return zipfile.ZipFile(file)
-
-
-def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; refuses one that unpacks to more bytes than it has."""
-    with open_archive(file) as archive:
+    with zipfile.ZipFile(file) as archive:  # reads the whole list
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:
             raise ValueError(f"it unpacks to more than the file, or {MAX_BYTES} bytes")
@@ -198,32 +188,42 @@ def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
 
 
 def step(
-    policy: Policy, memory: np.ndarray | None, observation: np.ndarray, normal: Any = 0.0
-) -> tuple[np.ndarray | None, np.ndarray]:
+    policy: Policy, memory: Any, observation: Any, normal: Any = 0.0, xp: Any = np
+) -> tuple[Any, Any]:
     """Draws actions as `act` does; returns the memory after this step, and the actions.
 
     Args:
       policy: As in `act`, with or without a memory.
       memory: [..., R, H] from `begin` or from the step before.
       observation, normal: As in `act`.
+      xp: `numpy`, or `jax.numpy` for a policy and observations of JAX.
     """
     _check(policy, memory, observation)
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
     x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
-    x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
+    x = xp.clip(x, -limit, limit)
+    if policy.network is not None:
+        x = policy.network(x)
     if policy.hearing is not None:
-        x = _hear([part[mine] for part in policy.hearing], policy, x)
+        x = _hear([part[mine] for part in policy.hearing], policy, x, xp)
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
-        x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])
-    if policy.memory is not None and memory is not None:
-        memory = _remember([part[mine] for part in policy.memory], memory, x)
-        x = np.concatenate([x, memory], axis=-1)
-    mean = np.vecmat(x, kernel[mine]) + bias[mine]
-    return memory, mean + np.exp(policy.log_std[mine]) * normal
+        x = _activate(policy, xp.vecmat(x, weights[mine]) + offset[mine], xp)
+    if policy.memory is not None:
+        memory = _remember([part[mine] for part in policy.memory], memory, x, xp)
+        x = xp.concatenate([x, memory], axis=-1)
+    mean = xp.vecmat(x, kernel[mine]) + bias[mine]
+    return memory, mean + xp.exp(policy.log_std[mine]) * normal
 
 
-def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -> None:
+def _activate(policy: Policy, x: Any, xp: Any) -> Any:
+    kind = policy.meta["activation"]
+    if kind == "swish":
+        return 0.5 * x * (1 + xp.tanh(0.5 * x))  # x * logistic(x), without overflow
+    return xp.tanh(x) if kind == "tanh" else xp.maximum(x, 0)
+
+
+def _check(policy: Policy, memory: Any, observation: Any) -> None:
     """Refuses arguments of `step` with wrong shapes."""
     robots, (learners, size) = observation.shape[-2], policy.mean.shape
     if robots > learners and not policy.is_shared:
@@ -236,26 +236,26 @@ def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -
         raise PolicyError(f"memory is {given}: give {wanted}, as `begin` returns it.")
 
 
-def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
+def _hear(parts: list[Any], policy: Policy, x: Any, xp: Any) -> Any:
     """Returns the observation with its neighbours replaced by the sum of one layer over them."""
     (kernel, bias), count = parts, policy.neighbours["count"]
     first = x.shape[-1] - count * kernel.shape[1]
     rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
-    each = _ACTIVATIONS[policy.meta["activation"]](np.matmul(rows, kernel) + bias[:, None])
-    return np.concatenate([x[..., :first], (each * rows[..., :1]).sum(-2)], axis=-1)
+    each = _activate(policy, xp.matmul(rows, kernel) + bias[:, None], xp)
+    return xp.concatenate([x[..., :first], (each * rows[..., :1]).sum(-2)], axis=-1)
 
 
-def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:
+def _remember(parts: list[Any], memory: Any, features: Any, xp: Any) -> Any:
     """Updates the memory with a gated recurrent unit (GRU) whose reset gate follows the product."""
-    seen = np.vecmat(features, parts[0]) + parts[1]
-    recalled = np.vecmat(memory, parts[2]) + parts[3]
-    (r, z, fresh), (r_, z_, old) = np.split(seen, 3, -1), np.split(recalled, 3, -1)
-    fresh = np.tanh(fresh + _logistic(r + r_) * old)
-    return fresh + _logistic(z + z_) * (memory - fresh)
 
+    def logistic(x: Any) -> Any:
+        return 0.5 + 0.5 * xp.tanh(0.5 * x)  # 1 / (1 + exp(-x)), without overflow
 
-def _logistic(x: np.ndarray) -> np.ndarray:
-    return 0.5 + 0.5 * np.tanh(0.5 * x)  # 1 / (1 + exp(-x)), without overflow
+    seen = xp.vecmat(features, parts[0]) + parts[1]
+    recalled = xp.vecmat(memory, parts[2]) + parts[3]
+    (r, z, fresh), (r_, z_, old) = xp.split(seen, 3, -1), xp.split(recalled, 3, -1)
+    fresh = xp.tanh(fresh + logistic(r + r_) * old)
+    return fresh + logistic(z + z_) * (memory - fresh)
 
 
 def command(policy: Policy, action: np.ndarray) -> np.ndarray:

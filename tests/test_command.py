@@ -24,7 +24,6 @@ from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.load_settings import load_run, load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.suite import SuiteConfig
 from swarmjax.task.stage_files import load_levels
 from swarmjax.watch.config import WatchConfig
 
@@ -36,7 +35,6 @@ COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.report": (partial(files.load, ReportConfig), ReportConfig),
     "swarmjax.replay": (partial(load_levels, ReplayConfig), ReplayConfig),
     "swarmjax.reproduce": (partial(files.load, ReproduceConfig), ReproduceConfig),
-    "swarmjax.suite": (partial(files.load, SuiteConfig), SuiteConfig),
     "swarmjax.watch": (partial(files.load, WatchConfig), WatchConfig),
 }
 EVERY_EXAMPLE = [

@@ -23,7 +23,6 @@ SOUND = {
     "swarmjax.report": ["run=a"],
     "swarmjax.replay": ["policy=a.npz"],
     "swarmjax.reproduce": [],
-    "swarmjax.suite": ["suite=dev"],
     "swarmjax.watch": ["run=a"],
 }
 TEXTS = [

@@ -135,8 +135,7 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
             r"meta.observation.neighbours.count is 0: expected a wh",
         ),
         (_HEARS, _heard(range=0), r"meta.observation.neighbours.range is 0: expected a number ab"),
-        (_HEARS, _heard(message_size=0), r"meta.observation.neighbours is .* without message_size"),
-        (_HEARS, _heard(count=9), r"meta.observation.neighbours takes 36 entries, but m"),
+        (_HEARS, _heard(count=9), r"actor/hidden_0/kernel has shape"),
         (_HEARS, _HEARD | {"format": 2}, r"meta.format is 2, but this version reads 5 only: "),
         (_HEARS, _HEARD | {"network": "mine"}, r"meta.observation.neighbours and meta.n"),
         (
@@ -151,11 +150,6 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
         (_with("actor/hidden_2/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/hidden_7/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
         (_with("actor/log_std", np.zeros((1, 2))), {}, r"actor/log_std is float64: expected float"),
-        (
-            _with("actor/log_std", np.full((1, 2), 21, np.float32)),
-            {},
-            r"actor/log_std holds a value above 20: expected the logarithm of a deviation",
-        ),
         (_with("actor/log_std", np.zeros((1, 2), ">f4")), {}, r"actor/log_std is >f4: expected fl"),
         (
             _with("actor/mean/bias", _f32([[1, 2, 3]])),
@@ -658,34 +652,3 @@ def test_any_field_of_a_signed_file_may_hold_anything(tmp_path: Path, value: Any
         with contextlib.suppress(PolicyError, ConfigError):  # the only two errors that are allowed
             trained_settings.load(EvaluateConfig, [f"policy={path}"])
             export.convert(ExportConfig(policy=str(path), format="c"), path, tmp_path / "out")
-
-
-def _filled(name: str, value: float) -> Arrays:
-    arrays = policies.arrays()
-    return arrays | {f"actor/{name}": np.full_like(arrays[f"actor/{name}"], value)}
-
-
-@pytest.mark.parametrize("name", ["hidden_0/kernel", "hidden_1/kernel", "mean/kernel"])
-def test_weights_that_overflow_float32_are_refused(tmp_path: Path, name: str) -> None:
-    forge(tmp_path / "policy.npz", _filled(name, 3e38), _said())
-    layer = name.removesuffix("/kernel")
-    with pytest.raises(PolicyError, match=rf"policy\.npz: actor/{layer} has weights up to 3e\+38"):
-        policy_file.read(tmp_path / "policy.npz")
-
-
-def test_the_bound_of_a_sum_is_worked_out_layer_by_layer(tmp_path: Path) -> None:
-    # Ten inputs of at most 10, weights of w: 100 w in each of four units. With relu, three units
-    # of weights 1e18 and then three of 1e17 follow: 4e2 w 1e18, and 1.2e20 w 1e17. With w = 1 this
-    # is 1.2e38, plus biases, which are small. With w = 3 it is 3.6e38, more than 3.4e38.
-    layers = {"hidden_0/kernel": 1.0, "hidden_1/kernel": 1e18, "mean/kernel": 1e17}
-    arrays = policies.arrays()
-    for name, value in layers.items():
-        arrays[f"actor/{name}"] = np.full_like(arrays[f"actor/{name}"], value)
-    forge(tmp_path / "policy.npz", arrays, _said(activation="relu"))
-    policy_file.read(tmp_path / "policy.npz")
-    arrays["actor/hidden_0/kernel"] *= 3
-    forge(tmp_path / "policy.npz", arrays, _said(activation="relu"))
-    with pytest.raises(PolicyError, match=r"sums could reach 3\.6e\+38"):
-        policy_file.read(tmp_path / "policy.npz")
-    forge(tmp_path / "policy.npz", arrays, _said(activation="tanh"))
-    policy_file.read(tmp_path / "policy.npz")

@@ -6,7 +6,7 @@ import numpy as np
 
 from swarmjax.adapters.library import find
 from swarmjax.adapters.robots import line_up
-from swarmjax.adapters.session import Session, errors, spaces
+from swarmjax.adapters.session import Session, spaces
 from swarmjax.environment import Swarm
 
 _vector: Any = find("gymnasium.vector", "gymnasium")
@@ -54,19 +54,12 @@ class SwarmVectorEnv(_vector.VectorEnv):
 
         Args:
           seed: seed of all following levels. None continues with the last seed.
-          options: unused. `reset_mask` is refused, since arenas reset themselves.
+          options: unused; arenas reset themselves.
 
         Returns:
           [N, O] observations, and an empty info.
-
-        Raises:
-          Error: if the seed is not an integer, or only some sub-environments should be reset.
         """
-        if seed is not None and not isinstance(seed, int | np.integer):
-            raise errors.Error(f"seed is {seed!r}: all arenas share one seed, a whole number.")
-        if "reset_mask" in (options or {}):
-            raise errors.Error("options has reset_mask, but reset starts all arenas: remove it.")
-        super().reset(seed=None if seed is None else int(seed))
+        super().reset(seed=seed)
         return self._session.reset(int(self.np_random.integers(2**31))), {}
 
     def step(

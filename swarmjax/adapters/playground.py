@@ -110,7 +110,3 @@ class SwarmMjxEnv(_playground.MjxEnv):
     def mjx_model(self) -> Any:
         """The model on the device, made on first use."""
         return find("mujoco.mjx", "playground").put_model(self.mj_model)
-
-    def render(self, *args: Any, **kwargs: Any) -> Any:
-        """Raises NotImplementedError."""
-        raise NotImplementedError("Pictures are drawn by swarmjax.replay.")

@@ -21,6 +21,7 @@ Examples:
 import json
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -45,7 +46,9 @@ def main(arguments: Sequence[str]) -> int:
     progress.disable = not progress.console.is_terminal
     try:
         with progress:
-            evaluation = evaluate(settings, None, progress, lambda: _say(said))
+            # Says which settings come from the policies before judging, which takes a minute.
+            announce = partial(print, f"swarmjax.evaluate: {said}", flush=True)
+            evaluation = evaluate(settings, None, progress, announce)
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
@@ -56,12 +59,6 @@ def main(arguments: Sequence[str]) -> int:
         console.width = PLAIN_WIDTH
     evaluate_table.show(console, evaluation.result)
     return 0
-
-
-def _say(sentence: str) -> None:
-    """Prints which settings come from the policies, before judging, which takes a minute."""
-    sys.stdout.write(f"swarmjax.evaluate: {sentence}\n")
-    sys.stdout.flush()
 
 
 def _content(out: Path, evaluation: Evaluation) -> dict[Path, bytes]:

@@ -1,6 +1,6 @@
 """Cells: sets of levels for judging policies, drawn from numbers or read from a file.
 
-A suite is a list of cells. Each cell has a digest of its levels. By comparing digests, everybody
+A suite is a list of cells. A cell may have a digest of its levels. By comparing digests, everybody
 who draws the levels can check that every bit is the same. Levels of a suite are drawn for the
 nominal e-puck.
 """
@@ -28,7 +28,6 @@ from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 2
 _TARGET_RADIUS = TaskConfig().target_radius
-_LARGEST_HALF = 2.5  # m, largest half edge of a box: longer than half the largest arena
 
 
 class Cell(NamedTuple):
@@ -108,17 +107,8 @@ def load(config: EvaluateConfig) -> Suite:
     return draw(config.suite)
 
 
-def stages(config: EvaluateConfig) -> list[StageConfig]:
-    """Lists the stages of an evaluation before drawing levels; none for a file of levels."""
-    if config.suite is None:
-        return [config.stage]
-    if Path(config.suite).suffix == ".npz":
-        return []
-    return [cell.stage for cell in read_suite(config.suite).cells]
-
-
 def draw(choice: str) -> Suite:
-    """Draws the levels of a suite and checks their digests.
+    """Draws the levels of a suite and checks the digests in its file.
 
     Args:
       choice: A name of configs/suites/, or the path of a .yaml file.
@@ -130,12 +120,7 @@ def draw(choice: str) -> Suite:
       ConfigError: The file is unsound, or a digest is wrong.
     """
     file = read_suite(choice)
-    drawn = []
-    for each in file.cells:
-        drawn.append(draw_cell(each))
-        if each.digest is not None:
-            _check_digest(drawn[-1], each.digest, f"suite {file.name}")
-    return Suite(file.name, tuple(drawn))
+    return Suite(file.name, tuple(map(draw_cell, file.cells)))
 
 
 def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
@@ -156,15 +141,26 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
 
 
 def draw_cell(cell: CellConfig) -> Cell:
-    """Draws the levels of a suite's cell, without checking the cell's digest."""
+    """Draws the levels of a suite's cell.
+
+    Raises:
+      ConfigError: The cell has another digest.
+    """
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
     return _cell(cell, np.array(numbers), levels)
 
 
-def _cell(cell: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
-    about = (cell.name, cell.stage, cell.shape, cell.realism, cell.seed)
-    return Cell(*about, episodes, levels, cell.steps, cell.hull_friction)
+def _cell(settings: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
+    """Makes a cell, and checks its digest if its settings have one."""
+    about = (settings.name, settings.stage, settings.shape, settings.realism, settings.seed)
+    cell = Cell(*about, episodes, levels, settings.steps, settings.hull_friction)
+    if settings.digest not in (None, cell.digest):
+        raise ConfigError(
+            f"cell {cell.name} has the digest {cell.digest[:12]}..., but "
+            f"{settings.digest[:12]}... is recorded: the levels differ."
+        )
+    return cell
 
 
 def _draw(
@@ -188,14 +184,6 @@ def split(levels: Level) -> list[Level]:
     return [Level(*each) for each in zip(*levels, strict=True)]
 
 
-def _check_digest(cell: Cell, expected: str, where: str) -> None:
-    if cell.digest != expected:
-        raise ConfigError(
-            f"cell {cell.name} of {where} has the digest {cell.digest[:12]}..., but "
-            f"{expected[:12]}... is recorded: the levels differ."
-        )
-
-
 def _arrays(cell: Cell) -> dict[str, np.ndarray]:
     return {"episode": cell.episodes, **cell.levels._asdict()}
 
@@ -204,7 +192,7 @@ def _arrays(cell: Cell) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, suite: Suite) -> None:
-    """Writes levels for other tools, completely or not at all; docs/evaluation.md lists the fields.
+    """Writes levels that no settings describe; docs/evaluation.md lists the fields.
 
     Args:
       path: Path of the .npz file.
@@ -229,7 +217,7 @@ def write(path: Path, suite: Suite) -> None:
 
 
 def read(path: Path) -> Suite:
-    """Reads levels that `write` or another tool has written, and checks all of them.
+    """Reads levels that `write` has written.
 
     Args:
       path: Path of the .npz file.
@@ -246,35 +234,26 @@ def read(path: Path) -> Suite:
             raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
         with path.open("rb") as file:
             arrays = policy.unpack(file)
+        return _parse(arrays)
     except Exception as error:  # zipfile and NumPy raise many types of errors for a damaged file
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise ConfigError(f"suite {path} cannot be read: {reason.rstrip('.')}.") from None
-    try:
-        return _parse(arrays)
-    except ConfigError as error:
-        raise ConfigError(f"suite {path}: {error}") from None
 
 
 def _parse(arrays: dict[str, np.ndarray]) -> Suite:
-    try:
-        meta = reading.parse_json(str(arrays.pop("meta", None)), "meta")
-    except ConfigError:
-        meta = None
+    meta = reading.parse_json(str(arrays.get("meta")), "meta")
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
-        raise ConfigError(f"meta.format is not {FORMAT}: this version cannot read the suite.")
+        raise ConfigError(f"meta.format is not {FORMAT}")
     file = build(SuiteFileConfig, {"name": meta.get("suite"), "cells": meta.get("cells")}, "meta.")
-    suite = Suite(file.name, tuple(_parse_cell(cell, arrays) for cell in file.cells))
-    if arrays:
-        raise ConfigError(f"{sorted(arrays)[0]} is unknown: meta.cells lists no such cell.")
-    return suite
+    return Suite(file.name, tuple(_parse_cell(cell, arrays) for cell in file.cells))
 
 
 def _parse_cell(cell: CellConfig, arrays: dict[str, np.ndarray]) -> Cell:
-    """Takes a cell's arrays from the file's arrays."""
-    name, count, robots = cell.name, cell.levels, cell.stage.robots
-    boxes = arrays.get(f"{name}/obstacle")
-    obstacles = boxes.shape[1] if boxes is not None and boxes.ndim == 3 else 0
-    expected = {
+    """Takes a cell's arrays from the file's arrays, and checks their types and shapes."""
+    count, robots = cell.levels, cell.stage.robots
+    boxes = arrays.get(f"{cell.name}/obstacle", np.empty(0))
+    obstacles = boxes.shape[1] if boxes.ndim == 3 else 0
+    forms = {
         "episode": (np.int64, (count,)),
         "side": (np.float32, (count,)),
         "present": (np.bool_, (count, robots)),
@@ -284,50 +263,9 @@ def _parse_cell(cell: CellConfig, arrays: dict[str, np.ndarray]) -> Cell:
         "obstacle": (np.float32, (count, obstacles, 5)),
         "seed": (np.uint32, (count,)),
     }
-    fields = {key: _take(arrays, f"{name}/{key}", *form) for key, form in expected.items()}
-    episodes, levels = fields.pop("episode"), Level(**fields)
-    _check_levels(name, levels, cell.stage)
-    read = _cell(cell, episodes, levels)
-    if cell.digest is None:
-        raise ConfigError(f"cell {name}: digest is missing.")
-    _check_digest(read, cell.digest, "the file")
-    return read
-
-
-def _take(
-    arrays: dict[str, np.ndarray], name: str, dtype: type, shape: tuple[int, ...]
-) -> np.ndarray:
-    """Takes one array from a file's arrays, and checks its type and shape."""
-    if name not in arrays:
-        raise ConfigError(f"{name} is missing.")
-    array = arrays.pop(name)
-    if array.dtype != dtype or array.shape != shape:
-        raise ConfigError(
-            f"{name} is {array.dtype} {list(array.shape)}: expected {np.dtype(dtype)} "
-            f"{list(shape)}."
-        )
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{name} holds numbers that are not finite.")
-    return array
-
-
-def _check_levels(name: str, levels: Level, stage: StageConfig) -> None:
-    """Refuses levels that are impossible in any arena."""
-    half = 0.5 * levels.side[:, None, None]
-    low, high = (np.float32(end) for end in stage.sides)
-    place, boxes = np.abs(levels.obstacle[..., :2]), levels.obstacle[..., 3:]
-    beyond = half + np.hypot(boxes[..., :1], boxes[..., 1:])  # for the circle around a box
-    rules = {
-        f"side is outside {show(stage.sides)} m": (levels.side < low) | (levels.side > high),
-        "present is not all true": ~levels.present,
-        "start lies outside the walls": np.abs(levels.start[..., :2]) > half,
-        "target lies outside the walls": np.abs(levels.target) > half,
-        "obstacle has half edges of 0 or less": boxes <= 0.0,
-        "obstacle lies outside the walls": levels.obstacle_present[..., None] & (place > half),
-        "obstacle is longer than the largest arena": boxes > _LARGEST_HALF,
-        "obstacle is not present, but stands inside the walls": ~levels.obstacle_present
-        & (place < beyond).all(axis=-1),
-    }
-    for what, broken in rules.items():
-        if broken.any():
-            raise ConfigError(f"cell {name}: {what}.")
+    fields = {key: arrays.get(f"{cell.name}/{key}", np.empty(0)) for key in forms}
+    for key, (dtype, shape) in forms.items():
+        array = fields[key]
+        if array.dtype != dtype or array.shape != shape or not np.isfinite(array).all():
+            raise ConfigError(f"{cell.name}/{key} is not finite {dtype.__name__} {list(shape)}")
+    return _cell(cell, fields.pop("episode"), Level(**fields))

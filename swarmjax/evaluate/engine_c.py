@@ -18,7 +18,6 @@ import numpy as np
 from swarmjax import policy
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import contacts, measures, rays
-from swarmjax.evaluate.contacts import Pushes
 from swarmjax.evaluate.judge import Judge
 from swarmjax.evaluate.judge import draw_level as draw_level
 from swarmjax.evaluate.judge import load as load
@@ -242,7 +241,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
             raise PolicyError("the policy has a memory: pass the action that `act` chooses.")
         _, action = act(judge, None, arenas)
     active = arrival.drives(task.arrival, before)
-    memory, pose, impulse = _drive(judge, arenas, action, active)
+    memory, pose = _drive(judge, arenas, action, active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
     arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
     touches = contacts.touching(judge, arenas.data)
@@ -259,7 +258,6 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         arrived=arrived,
         begins=begins,
         touches=touches,
-        impulse=impulse,
         sensed=(sight.ray < task.sensor_range).any(axis=-1),
     )
     outcome = measures.tally(arenas.outcome, events, np)
@@ -290,12 +288,8 @@ def _look_further(
 
 def _drive(
     judge: Judge, arenas: Arenas, action: np.ndarray, active: np.ndarray
-) -> tuple[Memory, np.ndarray, np.ndarray]:
-    """Lets the active robots drive.
-
-    Returns:
-      Memory, new poses [A, R, 3], and impulses [A, R, 3] (N s) by kind of contact.
-    """
+) -> tuple[Memory, np.ndarray]:
+    """Lets the active robots drive; returns memory and new poses [A, R, 3]."""
     wanted = sim_drive.command(action, judge.drive, np)
     memory, wheels = electronics.drive(
         judge.electronics,
@@ -309,32 +303,25 @@ def _drive(
     wheels = np.where(active[..., None], wheels, 0.0)
     body, robot = sim_model.BODIES[judge.config.robot.body], judge.config.robot
     ctrl = body.ctrl(wheels, electronics.chassis(arenas.factors), robot, np)
-    pushes: list[Pushes] = []
     for each in zip(arenas.model, arenas.data, ctrl, strict=True):
-        pushes += _advance(judge, *each)
+        _advance(judge, *each)
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
             "the physics broke down, with positions that are not finite: give more than "
             f"{judge.substeps} substeps, or a robot closer to the real one."
         )
-    return memory, body.pose(qpos, np), contacts.impulses(judge, pushes, len(arenas.data))
+    return memory, body.pose(qpos, np)
 
 
-def _advance(
-    judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray
-) -> list[Pushes]:
-    """Moves one arena by a control step; returns the contacts of each physics step."""
+def _advance(judge: Judge, model: mujoco.MjModel, data: mujoco.MjData, ctrl: np.ndarray) -> None:
+    """Moves one arena by a control step."""
     data.ctrl = ctrl
-    pushes = []
     # The two halves of mj_step run in reverse order, so that the rays of this control step see the
-    # positions from which the next step starts. Between the halves, the forces belong to the listed
-    # contacts.
+    # positions from which the next step starts.
     for _ in range(judge.substeps):
         mujoco.mj_step2(model, data)
-        pushes.append(contacts.push(model, data))
         mujoco.mj_step1(model, data)
-    return pushes
 
 
 def look(

@@ -5,6 +5,7 @@ analytic sensors and few solver steps. Published results come from MuJoCo C; thi
 """
 
 import functools
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -15,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from numpy.typing import ArrayLike
 
 from swarmjax import extension, policy, policy_network
 from swarmjax.config import ConfigError
@@ -23,20 +23,18 @@ from swarmjax.evaluate import judge, measures
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.measures import Outcome
 from swarmjax.policy import Policy
-from swarmjax.ppo.memory import remember
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
-from swarmjax.task import arrival, electronics, env
+from swarmjax.task import arrival, env
 from swarmjax.task import stage as task_stage
-from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
-LARGEST_BOX = 0.3  # m; largest size of a box that a stage allows
-_ACTIVATIONS = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+_ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
+_WEIGHTS = ("layers", "log_std", "mean", "std", "memory", "hearing")
 
 
 def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
@@ -51,7 +49,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
       The world, still without a policy's limits and encoding.
 
     Raises:
-      ConfigError: a box is larger than the engine supports.
+      ConfigError: a box is larger than a stage allows.
     """
     fits = half.max(initial=0.0) <= task_stage.largest_half([config.stage])
     stage = config.stage if fits else _largest(config.stage, half)
@@ -72,11 +70,6 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
 def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
     """Returns a stage with the same robot count and box size; the program needs only these."""
     largest = 2.0 * float(half.max(initial=0.05))  # without boxes any size will do
-    if largest > LARGEST_BOX:
-        raise ConfigError(
-            f"stage {stage.name}: a box is {largest:g} m long, but engine=mjx takes up to "
-            f"{LARGEST_BOX:g} m: give engine=c."
-        )
     return StageConfig(name=stage.name, robots=stage.robots, side=4.0, obstacle_size=largest)
 
 
@@ -93,25 +86,17 @@ def play(
       sampled: whether to draw the actions from the policy; otherwise they are its means.
 
     Returns:
-      [E] outcomes, as NumPy arrays; impulses are nan, since contacts are analytic here.
+      [E] outcomes, as NumPy arrays.
 
     Raises:
       ConfigError: the physics of an episode breaks down.
     """
-    run = _program(
-        world,
-        steps,
-        (trained.encoding, trained.meta["observation"]["limit"]),
-        judge.neighbours(trained),
-        (trained.max_speed, trained.max_turn_rate),
-        trained.meta["activation"],
-        sampled,
-        None if trained.network is None else trained.network.module,
-    )
-    network = None if trained.network is None else trained.network.params
-    weights = trained.layers, trained.mean, trained.std, network, trained.hearing, trained.memory
+    network = trained.network
+    about = json.dumps({key: trained.meta[key] for key in _ABOUT})
+    run = _program(world, steps, about, sampled, network and network.module)
+    weights = {name: getattr(trained, name) for name in _WEIGHTS}
     memory = policy.begin(trained, levels.present.shape)
-    outcome, broken = run(weights, trained.log_std, levels, memory)
+    outcome, broken = run(weights, network and network.params, levels, memory)
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
@@ -122,90 +107,55 @@ def play(
 
 @functools.lru_cache(maxsize=4)
 def _program(
-    world: World,
-    steps: int,
-    seen: tuple[electronics.Encoding, float],
-    heard: NeighboursConfig,
-    limits: tuple[float, float],
-    activation: str,
-    sampled: bool,
-    network: Any,
+    world: World, steps: int, about: str, sampled: bool, module: Any
 ) -> Callable[..., tuple[Outcome, Array]]:
-    """Compiles the program for policies that differ only in their weights."""
-    (encoding, limit), (speed, turn_rate) = seen, limits
+    """Compiles the program for policies that differ only in their weights.
+
+    Args:
+      world: result of `load`.
+      steps: control steps of an episode.
+      about: JSON of what a policy's description says under the keys `_ABOUT`.
+      sampled: whether to draw the actions.
+      module: Flax module of an extension's network; None if there is none.
+    """
+    meta = json.loads(about)
+    layout, (speed, turn_rate) = meta["observation"], meta["action"]["high"][:2]
+    weights: dict[str, Any] = dict.fromkeys(_WEIGHTS)  # given when the program runs
+    bare = Policy(
+        **weights,
+        is_shared=meta["policy"] == "shared",
+        encoding=layout["encoding"],
+        max_speed=speed,
+        max_turn_rate=turn_rate,
+        meta=meta,
+        digest="",
+    )
+    heard = judge.neighbours(bare)
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
         task=replace(world.task, neighbours=heard),
-        electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
+        electronics=replace(world.electronics, encoding=layout["encoding"], neighbours=heard),
     )
 
+    @jax.jit
     def play(
-        weights: Any, log_std: Array, levels: Level, memory: Array | None
+        weights: Any, params: Any, levels: Level, memory: Array | None
     ) -> tuple[Outcome, Array]:
-        mean = partial(_mean_action, activation, limit, weights, network, heard.count)
-        act = partial(_act, mean, log_std if sampled else None)
+        network = module and partial(policy_network.features, module, params)
+        trained = bare._replace(**weights, network=network)
+
+        def act(memory: Any, arenas: EnvState) -> tuple[Any, Array]:
+            """Draws the actions [E, R, U] with the judge's random numbers, or takes the means."""
+            shape = (arenas.observation.shape[-2], len(meta["action"]["names"]))
+            seed, clock = arenas.level.seed, arenas.clock
+            normal = noise.normal(seed, clock, Stream.ACTION, shape, jnp) if sampled else 0.0
+            with jax.default_matmul_precision("highest"):  # as NumPy computes
+                return policy.step(trained, memory, arenas.observation, normal, jnp)
+
         return run(mine, act, levels, steps, memory)[1:]
 
-    return jax.jit(play)
-
-
-def _act(
-    mean: Callable[[Any, Array], tuple[Any, Array]],
-    log_std: Array | None,
-    memory: Any,
-    arenas: EnvState,
-) -> tuple[Any, Array]:
-    """Returns the actions [E, R, U]: drawn with the judge's random numbers, or the means."""
-    memory, action = mean(memory, arenas.observation)
-    if log_std is None:
-        return memory, action
-    shape = action.shape[1:]
-    normal = noise.normal(arenas.level.seed, arenas.clock, Stream.ACTION, shape, jnp)
-    return memory, action + jnp.exp(log_std[: len(action[0])]) * normal
-
-
-def _mean_action(
-    activation: str,
-    limit: float,
-    weights: Any,
-    network: Any,
-    count: int,
-    memory: Any,
-    observation: Array,
-) -> tuple[Any, Array]:
-    """Computes the actions [E, R, U] of `policy.step` without noise, always in full precision."""
-    layers, mean, std, params, hearing, parts = weights
-    robots = slice(observation.shape[-2])
-    x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
-    if network is not None:
-        x = policy_network.features(network, params, x)
-    if hearing is not None:
-        x = _hear(_ACTIVATIONS[activation], hearing, count, x)
-    *hidden, last = layers
-    for layer in hidden:
-        x = _ACTIVATIONS[activation](_dense(x, layer, robots))
-    if parts is not None:
-        seen, recalled = _dense(x, parts[:2], robots), _dense(memory, parts[2:], robots)
-        memory = remember(seen, recalled, memory)
-        x = jnp.concatenate([x, memory], axis=-1)
-    return memory, _dense(x, last, robots)
-
-
-def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) -> Array:
-    """Computes `policy.step`'s result for the neighbours in x [E, R, O], in full precision."""
-    kernel, bias = (jnp.asarray(part)[: x.shape[-2]] for part in layer)
-    first = x.shape[-1] - count * kernel.shape[1]
-    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
-    each = jnp.matmul(rows, kernel, precision=jax.lax.Precision.HIGHEST) + bias[:, None]
-    return jnp.concatenate([x[..., :first], (activate(each) * rows[..., :1]).sum(-2)], axis=-1)
-
-
-def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:
-    """Applies a dense layer [E, R, in] -> [E, R, out], shared by all robots or one per robot."""
-    kernel, bias = (jnp.asarray(part)[robots] for part in layer)
-    kernel = jnp.broadcast_to(kernel, (x.shape[-2], *kernel.shape[1:]))
-    return jnp.einsum("eri,rio->ero", x, kernel, precision=jax.lax.Precision.HIGHEST) + bias
+    return play
 
 
 # Takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
@@ -278,6 +228,5 @@ def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
         arrived=after.arrived,
         begins=after.episode.contacts - before.episode.contacts,
         touches=after.apart == 0.0,
-        impulse=jnp.nan,
         sensed=after.episode.sensed > before.episode.sensed,
     )

@@ -52,10 +52,10 @@ def evaluate(
     """
     sides = _read(settings) if entrants is None else [entrants]
     every = [each for side in sides for each in side]
-    for stage in cells.stages(settings):  # before drawing levels, which takes a while
-        for path, trained in every:
-            judge.check_policy(settings, stage, path, trained)
     suite = cells.load(settings)
+    for cell in suite.cells:
+        for path, trained in every:
+            judge.check_policy(settings, cell.stage, path, trained)
     announce()
     progress = progress or Progress(disable=True)
     total = sum(len(every) * len(cell.episodes) for cell in suite.cells)

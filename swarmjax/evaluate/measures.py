@@ -30,7 +30,6 @@ class Outcome(NamedTuple):
         control steps until it was within its target and stayed there.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
       touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
-      impulse: [A, R, 3] normal impulse of the contacts, N s; nan if the engine does not compute it.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.
       moving: [A, R] control steps before arrival; with `hold`, control steps that began outside the
         target.
@@ -45,7 +44,6 @@ class Outcome(NamedTuple):
     arrival: Any
     contacts: Any
     touched: Any
-    impulse: Any
     sensed: Any
     moving: Any
     path: Any
@@ -62,7 +60,6 @@ class Events(NamedTuple):
       arrived: [A, R] whether a robot has arrived after the step.
       begins: [A, R, 3] whether a contact begins, by kind.
       touches: [A, R, 3] whether the robot touches something at the end of the step.
-      impulse: [A, R, 3] normal impulse of the contacts, N s, or nan.
       sensed: [A, R] whether an infrared ray met something in range.
     """
 
@@ -71,7 +68,6 @@ class Events(NamedTuple):
     arrived: Any
     begins: Any
     touches: Any
-    impulse: Any
     sensed: Any
 
 
@@ -90,7 +86,6 @@ def begin(place: Any, xp: Any) -> Outcome:
         arrival=count,
         contacts=by_kind,
         touched=by_kind,
-        impulse=by_kind.astype(float),
         sensed=count,
         moving=count,
         path=count.astype(float),
@@ -117,7 +112,6 @@ def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
         arrival=xp.where(step.arrived, since, 0),
         contacts=before.contacts + step.begins,
         touched=before.touched + step.touches,
-        impulse=before.impulse + step.impulse,
         sensed=before.sensed + (under_way & step.sensed),
         moving=before.moving + under_way,
         path=before.path + xp.where(under_way, driven, 0.0),
@@ -155,7 +149,6 @@ MEASURES: dict[str, Measure] = {
     "spl": Measure("path efficiency, SPL", "%", is_good=True),
     **_by_kind("contacts", "contacts per robot", ""),
     **_by_kind("contact_s", "in contact per robot", "s"),
-    **_by_kind("impulse_ns", "impulse per robot", "N s"),
     "ir_steps_share": Measure("steps with infrared", "%"),
     "deadlocks": Measure("in deadlock", "%"),
     "time_outs": Measure("timed out", "%"),
@@ -190,8 +183,6 @@ def per_level(
         **_split("contacts", outcome.contacts),
         **_split("contact_s", outcome.touched * control_step),
     }
-    if not np.isnan(outcome.impulse).any():
-        values |= _split("impulse_ns", outcome.impulse)
     if shortest is not None:
         values["spl"] = _efficiency(outcome, shortest).mean(axis=-1)
     return {name: values[name].astype(float) for name in MEASURES if name in values}

@@ -31,7 +31,7 @@ refused. Values of nan and -inf are refused too.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -153,8 +153,8 @@ def bootstrap(
       ValueError: the values are refused.
     """
     table = _table("values", values, draw)
-    draws = _distributions((table,), statistic, _Resampling(draw, strata, resamples))[0]
-    return _interval(float(_apply(statistic, table)), draws)
+    how = _How(draw, strata, resamples, table.size)
+    return _resampled(lambda at: statistic(table[at], axis=(-2, -1)), how, table.shape)
 
 
 def paired(
@@ -193,10 +193,12 @@ def paired(
             raise ValueError(
                 f"{name} holds inf, and inf - inf is no number: use probability_of_improvement."
             )
-    resampling = _Resampling(draw, strata, resamples)
-    of_a, of_b = _distributions((before, after), statistic, resampling)
-    estimate = float(_apply(statistic, after)) - float(_apply(statistic, before))
-    return _interval(estimate, of_b - of_a)
+
+    def difference(at: _Index) -> np.ndarray:
+        of_b, of_a = (statistic(table[at], axis=(-2, -1)) for table in (after, before))
+        return of_b - of_a
+
+    return _resampled(difference, _How(draw, strata, resamples, before.size), before.shape)
 
 
 def probability_of_improvement(
@@ -235,14 +237,14 @@ def probability_of_improvement(
             "tasks."
         )
     wins = (ours[:, None] > theirs) + 0.5 * (ours[:, None] == theirs)
-    resampling, random, draws = _Resampling(draw, strata, resamples), np.random.default_rng(0), []
-    for count in resampling.blocks(wins.size):
-        mine, tasks = resampling.indices(random, count, ours.shape)
-        other, _ = resampling.indices(random, count, theirs.shape)
+
+    def chance(at: _Index, other: _Index) -> np.ndarray:
+        (mine, tasks), (their, _) = at, other
         # Axes: resamples, runs of a, runs of b, tasks. An axis that is not drawn has one resample.
-        drawn = wins[mine[..., :, None, :], other[..., None, :, :], tasks[..., None, :]]
-        draws.append(drawn.mean(axis=(1, 2, 3)))
-    return _interval(float(wins.mean()), np.concatenate(draws))
+        drawn = wins[mine[..., :, None, :], their[..., None, :, :], tasks[..., None, :]]
+        return drawn.mean(axis=(-3, -2, -1))
+
+    return _resampled(chance, _How(draw, strata, resamples, wins.size), ours.shape, theirs.shape)
 
 
 def curve(
@@ -304,62 +306,52 @@ def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     return values
 
 
-class _Resampling(NamedTuple):
-    """How values [runs, tasks] are drawn; the fields are arguments of `bootstrap`."""
+# Rows and columns of values, which broadcast to [runs, tasks] or to [count, runs, tasks].
+type _Index = tuple[np.ndarray, np.ndarray]
+
+
+class _How(NamedTuple):
+    """How values [runs, tasks] are drawn: arguments of `bootstrap`, and values a resample."""
 
     draw: Draw
     strata: Sequence[int] | None
     resamples: int
+    size: int
 
-    def blocks(self, cells: int) -> Iterator[int]:
-        """Splits resamples, with this number of values each, into blocks that fit the memory."""
-        block = max(1, BLOCK // cells)
-        for first in range(0, self.resamples, block):
-            yield min(block, self.resamples - first)
-
-    def indices(
-        self, random: np.random.Generator, count: int, shape: tuple[int, ...]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Draws indices of values: two arrays that broadcast to [count, runs, tasks]."""
+    def indices(self, random: np.random.Generator, count: int, shape: tuple[int, ...]) -> _Index:
+        """Draws indices of `count` resamples."""
         runs, tasks = shape
-        row, column = np.arange(runs)[:, None], np.arange(tasks)[None]
+        row, column = _all(shape)
         if "runs" in self.draw:
             row = random.integers(runs, size=(count, runs, 1))
         if "tasks" in self.draw:
-            column = random.integers(*self._group(tasks), size=(count, 1, tasks))
+            strata = self.strata or [tasks]
+            ends = np.repeat(np.cumsum(strata), strata)
+            column = random.integers(ends - np.repeat(strata, strata), ends, (count, 1, tasks))
         return row, column
 
-    def _group(self, tasks: int) -> tuple[Any, Any]:
-        """Returns the bounds of the group that each task is drawn from."""
-        if self.strata is None:
-            return 0, tasks
-        ends = np.cumsum(self.strata)
-        return np.repeat(ends - self.strata, self.strata), np.repeat(ends, self.strata)
+
+def _all(shape: tuple[int, ...]) -> _Index:
+    """Returns the indices of the values themselves."""
+    runs, tasks = shape
+    return np.arange(runs)[:, None], np.arange(tasks)[None]
 
 
-def _distributions(
-    tables: tuple[np.ndarray, ...], statistic: Statistic, resampling: _Resampling
-) -> np.ndarray:
-    """Computes statistics [tables, resamples] of tables of one shape, all with the same draws."""
-    random, drawn = np.random.default_rng(0), []
-    for count in resampling.blocks(tables[0].size):
-        index = resampling.indices(random, count, tables[0].shape)
-        drawn.append([_apply(statistic, table[index]) for table in tables])
-    return np.concatenate(drawn, axis=1)
-
-
-def _apply(statistic: Statistic, x: np.ndarray) -> np.ndarray:
-    """Computes statistics [...] of x [..., runs, tasks]."""
-    return np.asarray(statistic(x, axis=(-2, -1)))
-
-
-def _interval(estimate: float, draws: np.ndarray) -> Interval[float]:
-    """Computes the percentile interval of draws [resamples].
+def _resampled(
+    compute: Callable[..., np.ndarray], how: _How, *shapes: tuple[int, ...]
+) -> Interval[float]:
+    """Computes the percentile interval of a figure of tables with these shapes.
 
     The interval's ends are draws, never mixtures of two draws, because a mixture of inf and inf
     would be nan.
     """
-    last = len(draws) - 1
+    random, draws = np.random.default_rng(0), []
+    block = max(1, BLOCK // how.size)  # resamples that fit the memory
+    for first in range(0, how.resamples, block):
+        count = min(block, how.resamples - first)
+        draws.append(compute(*(how.indices(random, count, shape) for shape in shapes)))
+    last = how.resamples - 1
     low = math.floor((1 - CONFIDENCE) / 2 * last)
-    ordered = np.partition(draws, (low, last - low))
-    return Interval(estimate, float(ordered[low]), float(ordered[last - low]))
+    ordered = np.partition(np.concatenate(draws), (low, last - low))
+    estimate = compute(*map(_all, shapes))
+    return Interval(float(estimate), float(ordered[low]), float(ordered[last - low]))

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from swarmjax.config import ConfigError, Section, about, build, files, reading, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
-from swarmjax.sim.config import MOST_HULL_FRICTION, RobotConfig
+from swarmjax.sim.config import MOST_HULL_FRICTION
 from swarmjax.task import stage_files
 from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
@@ -49,16 +49,6 @@ class CellConfig(Section):
             raise ConfigError(
                 f"levels is {self.levels}, but episodes lists {len(self.episodes)}: give as many "
                 "episodes as levels."
-            )
-        if len(set(self.episodes)) != len(self.episodes):
-            raise ConfigError("episodes holds a number twice: give each once.")
-        if self.hull_friction is not None:
-            build(
-                RobotConfig, {"hull_friction": self.hull_friction}
-            )  # which checks the lower bound too
-        if self.shape != "box" and self.stage.level == "fixed":
-            raise ConfigError(
-                f"shape is {self.shape}, but the stage's level is fixed: give shape=box."
             )
 
 

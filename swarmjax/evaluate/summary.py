@@ -178,10 +178,9 @@ def compare(
       strata: As in `summarize`.
 
     Returns:
-      For each measure that both have, the means `a` and `b`; `difference`, b - a of the means;
-      `difference_iqm`, b - a of the interquartile means; and `improvement`, the probability that b
-      is better on a level. Each of the last three has an interval, under its name with `_interval`
-      appended.
+      For each measure that both have, the means `a` and `b`; `difference`, b - a of the means; and
+      `improvement`, the probability that b is better on a level. Each of the last two has an
+      interval, under its name with `_interval` appended.
     """
     return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
 
@@ -193,11 +192,10 @@ def _comparison(
     figures: dict[str, Any] = {"a": float(a.mean()), "b": float(b.mean())}
     if not _are_enough(a, strata):
         return figures
-    paired = partial(statistics.paired, a, b, draw=_draw(a), strata=strata)
-    chance = statistics.probability_of_improvement(better, worse, draw=_draw(a), strata=strata)
+    drawn: dict[str, Any] = {"draw": _draw(a), "strata": strata}
+    chance = statistics.probability_of_improvement(better, worse, **drawn)
     parts: dict[str, Interval[float]] = {
-        "difference": paired(statistic=np.mean),
-        "difference_iqm": paired(statistic=statistics.iqm),
+        "difference": statistics.paired(a, b, np.mean, **drawn),
         "improvement": chance,
     }
     for key, (estimate, low, high) in parts.items():

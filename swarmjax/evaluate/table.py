@@ -2,9 +2,10 @@
 
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -148,15 +149,9 @@ def levels(entrants: Sequence[Entrant], trials: Sequence[Trial]) -> str:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["cell", "episode", "policy", "unreachable", *names])
     for trial in trials:
-        rows.writerows(_rows(entrants, trial, names))
+        lost = np.isinf(trial.shortest).sum(axis=-1).tolist()
+        for i, entrant in enumerate(entrants):
+            table = zip(*(trial.measures[name][i].tolist() for name in names), strict=True)
+            for number, missing, values in zip(trial.cell.episodes, lost, table, strict=True):
+                rows.writerow([trial.cell.name, int(number), entrant.path, missing, *values])
     return text.getvalue()
-
-
-def _rows(
-    entrants: Sequence[Entrant], trial: Trial, names: Sequence[str]
-) -> Iterator[list[object]]:
-    lost = (trial.shortest == float("inf")).sum(axis=-1).tolist()
-    for i, entrant in enumerate(entrants):
-        table = zip(*(trial.measures[name][i].tolist() for name in names), strict=True)
-        for number, missing, values in zip(trial.cell.episodes, lost, table, strict=True):
-            yield [trial.cell.name, int(number), entrant.path, missing, *values]

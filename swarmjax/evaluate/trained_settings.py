@@ -141,10 +141,9 @@ def _check_alike(
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]
             if key not in given and key not in _OWN:
-                first, other = (_value(each, key) for each in (words[0], mine))
                 raise ConfigError(
-                    f"{paths[0]} and {path} were trained differently, with {key} {first} and "
-                    f"{other}: choose the one to judge them with, as in {word}."
+                    f"{paths[0]} and {path} were trained with different values of {key}: choose "
+                    f"the one to judge them with, as in {word}."
                 )
 
 
@@ -162,12 +161,6 @@ def _check_own(settings: Any, trainings: Mapping[str, Trained]) -> None:
                     f"{key} is {given}, but {path} was trained with {held}: leave {key} out, since "
                     "each policy is judged with the value that it was trained with."
                 )
-
-
-def _value(words: list[str], key: str) -> str:
-    """Finds the value of a key in arguments."""
-    values = [word.partition("=")[2] for word in words if word.partition("=")[0] == key]
-    return values[0] if values else "its default"
 
 
 def _say(settings: Any, typed: Sequence[str]) -> str:

@@ -92,12 +92,8 @@ def run(
       A trial for each cell, as soon as it is finished.
 
     Raises:
-      PolicyError: A policy does not fit a cell.
-      ConfigError: The physics breaks down.
+      ConfigError: A cell does not fit the settings, or the physics breaks down.
     """
-    for cell in cells:
-        for each in entrants:
-            evaluate_judge.check_policy(config, cell.stage, *each)
     # Checks all cells before the first one runs.
     configs = [specialise(config, cell) for cell in cells]
     play = _by_mjx if config.engine == "mjx" else _by_c

@@ -17,7 +17,6 @@ Examples:
   python -m swarmjax.export policy=policy.npz format=webots
 """
 
-import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -89,8 +88,6 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
         raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
-    if settings.format == "webots":
-        _check_controller(out)
     return out
 
 
@@ -100,15 +97,6 @@ def _default(settings: ExportConfig) -> str:
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
     )
-
-
-def _check_controller(out: Path) -> None:
-    """Checks that a folder's name can be the name of a controller's module."""
-    if not re.fullmatch(r"[A-Za-z_][\w-]*", out.name, re.ASCII):
-        raise ConfigError(
-            f"out is {out}, whose name is also the controller's: give letters, digits, _ and - "
-            "only, as in swarmjax_epuck."
-        )
 
 
 def convert(settings: ExportConfig, source: Path, out: Path) -> None:
@@ -129,7 +117,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
         return
     # Refuses numbers that the archive's reader leaves unchecked.
     trained_settings.trained(meta, str(source))
-    _check_form(meta, settings.format, settings.sensors)
+    _check_form(meta, settings.format)
     trained = policy_file.read(source)
     if settings.format == "onnx":
         outputs.write({out: onnx.render(trained)})
@@ -137,24 +125,24 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     if settings.format == "c":
         made = c.render(trained)
     else:
-        made = webots.render(trained, content, settings.sensors, out.name)
+        made = webots.render(trained, content, out.name)
     outputs.write({out / name: each for name, each in made.items()})
 
 
-def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
+def _check_form(meta: Mapping[str, Any], form: str) -> None:
     """Checks that a form can hold a policy, and that its controller can measure all inputs."""
     if "network" in meta:
         raise PolicyError(
             f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
             "extension that only npz supports: give format=npz, or train with algo.network=mlp."
         )
-    if form != "webots":
-        return
     if "neighbours" in meta["observation"]:
         raise PolicyError(
-            "format is webots, but the policy observes neighbours, and the controller has no "
-            "board for range and bearing: give format=c or onnx, and your own controller."
+            f"format is {form}, but the policy observes neighbours, which only npz supports: give "
+            "format=npz, or train with task.neighbours.count=0."
         )
+    if form != "webots":
+        return
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:
@@ -162,16 +150,16 @@ def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
             f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
             "cannot measure: give format=c or onnx, and your own controller."
         )
-    _check_range(meta, sensors)
+    _check_range(meta)
 
 
-def _check_range(meta: Mapping[str, Any], sensors: str) -> None:
+def _check_range(meta: Mapping[str, Any]) -> None:
     """Checks that the policy's infrared reaches no further than the sensors measure distances."""
-    reach, farthest = meta["sensors"]["range"], response.REACH[sensors]
+    reach, farthest = meta["sensors"]["range"], response.REACH["webots"]
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(
             f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
-            f"sensors={sensors} measure distances only to {farthest:g} m: train with "
+            f"Webots' sensors measure distances only to {farthest:g} m: train with "
             f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
         )
 

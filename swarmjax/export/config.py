@@ -28,9 +28,6 @@ class ExportConfig(Section):
     extensions: str | None = setting(
         None, "Python file with the pieces that the policy needs; it is executed"
     )
-    sensors: Literal["webots", "real"] = setting(
-        "webots", "sensors of the webots controller: simulated or real e-pucks"
-    )
 
     def _check(self) -> None:
         if (self.run is None) == (self.policy is None):
@@ -43,9 +40,5 @@ class ExportConfig(Section):
                 raise ConfigError(
                     f"{key} is {getattr(self, key)}, but policy is one file: give {key} with run."
                 )
-        if self.sensors != "webots" and self.format != "webots":
-            raise ConfigError(
-                f"sensors is {self.sensors}, but format is {self.format}: give format=webots."
-            )
         if self.out is None and self.run is None and self.format == "npz":
             raise ConfigError("out is null, but policy is already an npz file: give out=FILE.")

@@ -20,13 +20,11 @@ IR_VERSION = 8
 
 
 class _Graph:
-    """A chain of operations; each takes the result of the one before."""
+    """The operations of a graph, in order, and its constants."""
 
-    def __init__(self, start: str) -> None:
-        """Starts at the graph's input."""
+    def __init__(self) -> None:
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
-        self.value = start
 
     def constant(self, value: Any, dtype: Any = np.float32) -> str:
         """Adds a constant and returns its name."""
@@ -36,14 +34,13 @@ class _Graph:
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
         return name
 
-    def then(self, operation: str, *others: str, name: str | None = None, **options: Any) -> str:
-        """Adds an operation on the newest value and `others`; returns the name of its result."""
+    def add(self, operation: str, *inputs: str, name: str = "", **options: Any) -> str:
+        """Adds an operation and returns the name of its result, which is its last output."""
         from onnx import helper
 
         result = name or f"value_{len(self.nodes)}"
-        node = helper.make_node(operation, [self.value, *others], [result], **options)
-        self.nodes.append(node)
-        self.value = result
+        outputs = ["", result] if operation == "GRU" else [result]
+        self.nodes.append(helper.make_node(operation, list(inputs), outputs, **options))
         return result
 
 
@@ -70,28 +67,20 @@ def render(policy: Policy) -> bytes:
         raise ConfigError(
             "format is onnx, but the package onnx is not installed: run uv sync --extra onnx."
         ) from None
-    graph = _graph(policy)
+    graph, actions = _graph(policy), len(policy.meta["action"]["names"])
     leading = ["batch"] if policy.is_shared else ["batch", len(policy.mean)]
-
-    def port(name: str, size: int) -> Any:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
-
-    actions = len(policy.meta["action"]["names"])
-    recalled = [policy.carried] if policy.carried else []
-    made = helper.make_graph(
-        graph.nodes,
-        "policy",
+    takes = {"observation": policy.mean.shape[1]}
+    gives = {"action": actions, "command": actions}
+    if policy.carried:
+        takes, gives = takes | {"memory": policy.carried}, gives | {"memory_after": policy.carried}
+    inputs, outputs = (
         [
-            port("observation", policy.mean.shape[1]),
-            *(port("memory", n) for n in recalled),
-        ],
-        [
-            port("action", actions),
-            port("command", actions),
-            *(port("memory_after", n) for n in recalled),
-        ],
-        graph.constants,
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, [*leading, size])
+            for name, size in sizes.items()
+        ]
+        for sizes in (takes, gives)
     )
+    made = helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.constants)
     operators = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(
         made, producer_name="swarmjax", ir_version=IR_VERSION, opset_imports=operators
@@ -101,115 +90,77 @@ def render(policy: Policy) -> bytes:
 
 
 def _graph(policy: Policy) -> _Graph:
-    """Chains the operations of `policy.act` and `policy.command`."""
-    graph = _Graph("observation")
-    limit = policy.meta["observation"]["limit"]
-    shared = policy.is_shared
-
-    def rows(array: np.ndarray) -> str:
-        """Adds a constant that broadcasts over the rows of a batch; robots come first."""
-        return graph.constant(array[0] if shared else array[:, None])
-
-    if not shared:
-        graph.then("Transpose", perm=[1, 0, 2])  # robots first, so that each gets its own matrix
-    graph.then("Sub", rows(policy.mean))
-    graph.then("Div", rows(policy.std))
-    graph.then("Clip", graph.constant(-limit), graph.constant(limit))
-    _hear(graph, policy)
-    for i, (kernel, bias) in enumerate(policy.layers):
-        last = i == len(policy.layers) - 1
-        if last and policy.memory is not None:
-            _remember(graph, policy.memory, shared=shared)
-        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
-        graph.then("Add", rows(bias), name="action" if last and shared else None)
-        if not last:
-            _activate(graph, policy.meta["activation"])
-    if not shared:
-        graph.then("Transpose", perm=[1, 0, 2], name="action")
-    _command(graph, policy)
+    """Writes the operations of `policy.act` and `policy.command`, learner by learner."""
+    graph = _Graph()
+    names = ("action", "memory_after") if policy.carried else ("action",)
+    results = [_learner(graph, policy, i) for i in range(len(policy.mean))]
+    for name, values in zip(names, zip(*results, strict=True), strict=True):
+        if policy.is_shared:
+            graph.add("Identity", values[0], name=name)
+        else:
+            axis = graph.constant([1], np.int64)
+            rows = [graph.add("Unsqueeze", value, axis) for value in values]
+            graph.add("Concat", *rows, axis=1, name=name)
+    low, high = (np.array(policy.meta["action"][key]) for key in ("low", "high"))
+    x = graph.add("Clip", "action", graph.constant(-1.0), graph.constant(1.0))
+    x = graph.add("Mul", x, graph.constant((high - low) / 2))
+    graph.add("Add", x, graph.constant((high + low) / 2), name="command")
     return graph
 
 
-def _command(graph: _Graph, policy: Policy) -> None:
-    """Scales the action to the command."""
-    graph.then("Clip", graph.constant(-1.0), graph.constant(1.0))
-    low, high = (np.array(policy.meta["action"][key]) for key in ("low", "high"))
-    graph.then("Mul", graph.constant((high - low) / 2))
-    graph.then("Add", graph.constant((high + low) / 2), name="command")
+def _learner(graph: _Graph, policy: Policy, i: int) -> tuple[str, ...]:
+    """Adds the networks of learner i; returns its action [B, U] and perhaps its memory [B, H]."""
+
+    def mine(name: str) -> str:
+        """Selects the robot's part of an input."""
+        if policy.is_shared:
+            return name
+        return graph.add("Gather", name, graph.constant(i, np.int64), axis=1)
+
+    def dense(x: str, layer: tuple[np.ndarray, np.ndarray]) -> str:
+        return graph.add("Gemm", x, *(graph.constant(part[i]) for part in layer))
+
+    limit = policy.meta["observation"]["limit"]
+    x = graph.add("Sub", mine("observation"), graph.constant(policy.mean[i]))
+    x = graph.add("Div", x, graph.constant(policy.std[i]))
+    x = graph.add("Clip", x, graph.constant(-limit), graph.constant(limit))
+    for layer in policy.layers[:-1]:
+        x = _activate(graph, policy.meta["activation"], dense(x, layer))
+    if policy.memory is None:
+        return (dense(x, policy.layers[-1]),)
+    memory = _remember(graph, [part[i] for part in policy.memory], x, mine("memory"))
+    x = graph.add("Concat", x, memory, axis=-1)
+    return dense(x, policy.layers[-1]), memory
 
 
-def _hear(graph: _Graph, policy: Policy) -> None:
-    """Replaces the neighbours' entries with one layer's sum over neighbours, if there are any."""
-    if policy.hearing is None:
-        return
-    (kernel, bias), seen, shared = policy.hearing, graph.value, policy.is_shared
-    count, width = policy.neighbours["count"], kernel.shape[1]
-    first = policy.mean.shape[1] - count * width
+def _remember(graph: _Graph, parts: list[np.ndarray], x: str, memory: str) -> str:
+    """Adds the gated recurrent unit of `policy.step`; returns the memory [B, H] after it."""
 
-    def cut(source: str, start: int, end: int) -> str:
-        """Slices the last axis."""
-        graph.value = source
-        return graph.then("Slice", *(graph.constant([x], np.int64) for x in (start, end, -1)))
+    def ordered(part: np.ndarray) -> np.ndarray:
+        """Puts reset, update and candidate gate [..., 3 H] into ONNX's order: update first."""
+        reset, update, candidate = np.split(part, 3, axis=-1)
+        return np.concatenate([update, reset, candidate], axis=-1)
 
-    own = cut(seen, 0, first)
-    cut(seen, first, policy.mean.shape[1])
-    leading = [0] if shared else [0, 0]  # 0 keeps the size
-    rows = graph.then("Reshape", graph.constant([*leading, count, width], np.int64))
-    is_there = cut(rows, 0, 1)
-    graph.value = rows
-    graph.then("MatMul", graph.constant(kernel[0] if shared else kernel[:, None]))
-    graph.then("Add", graph.constant(bias[0] if shared else bias[:, None, None]))
-    _activate(graph, policy.meta["activation"])
-    graph.then("Mul", is_there)
-    heard = graph.then("ReduceSum", graph.constant([-2], np.int64), keepdims=0)
-    graph.value = own
-    graph.then("Concat", heard, axis=-1)
+    seen, seen_bias, recalled, recalled_bias = map(ordered, parts)
+    first = graph.constant([0], np.int64)  # the axis of time in x, and of direction elsewhere
+    after = graph.add(
+        "GRU",
+        graph.add("Unsqueeze", x, first),
+        graph.constant(seen.T[None]),
+        graph.constant(recalled.T[None]),
+        graph.constant(np.concatenate([seen_bias, recalled_bias])[None]),
+        "",  # all sequences have the same length
+        graph.add("Unsqueeze", memory, first),
+        hidden_size=len(recalled),
+        linear_before_reset=1,
+    )
+    return graph.add("Squeeze", after, first)
 
 
-def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> None:
-    """Adds the gated recurrent unit of `policy.step` and appends its state to the features."""
-    size, features = parts[2].shape[1], graph.value
-    graph.value = "memory"
-    old = graph.value if shared else graph.then("Transpose", perm=[1, 0, 2])
-
-    def product(source: str, weights: tuple[np.ndarray, ...], gate: int) -> str:
-        """Computes the product of one gate: 0 reset, 1 update, 2 candidate."""
-        mine = slice(gate * size, (gate + 1) * size)
-        kernel, bias = weights[0][..., mine], weights[1][..., mine]
-        graph.value = source
-        graph.then("MatMul", graph.constant(kernel[0] if shared else kernel))
-        return graph.then("Add", graph.constant(bias[0] if shared else bias[:, None]))
-
-    def opened(gate: int) -> str:
-        """Computes the reset or update gate, within 0..1."""
-        seen = product(features, parts[:2], gate)
-        product(old, parts[2:], gate)
-        graph.then("Add", seen)
-        return graph.then("Sigmoid")
-
-    reset, update = opened(0), opened(1)
-    seen = product(features, parts[:2], 2)
-    product(old, parts[2:], 2)
-    graph.then("Mul", reset)
-    graph.then("Add", seen)
-    fresh = graph.then("Tanh")
-    graph.value = old
-    graph.then("Sub", fresh)
-    graph.then("Mul", update)
-    after = graph.then("Add", fresh, name="memory_after" if shared else None)
-    if not shared:
-        graph.then("Transpose", perm=[1, 0, 2], name="memory_after")
-    graph.value = features
-    graph.then("Concat", after, axis=-1)
-
-
-def _activate(graph: _Graph, activation: str) -> None:
-    before = graph.value
+def _activate(graph: _Graph, activation: str, x: str) -> str:
     if activation == "swish":
-        graph.then("Sigmoid")
-        graph.then("Mul", before)
-    else:
-        graph.then({"tanh": "Tanh", "relu": "Relu"}[activation])
+        return graph.add("Mul", x, graph.add("Sigmoid", x))
+    return graph.add({"tanh": "Tanh", "relu": "Relu"}[activation], x)
 
 
 def _properties(policy: Policy) -> dict[str, str]:

@@ -5,9 +5,8 @@ needs `policy.npz` and `sensors.json` in the same folder. The second file gives 
 sensors' counts.
 
 The target is `target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may
-change. A policy that is not shared also needs `robot=i`, the robot's number from 0. controllerArgs
-take precedence. The robot draws its actions from the policy. With `action=mean` it takes the most
-likely action.
+change. A policy that is not shared also needs `robot=i`, the robot's number from 0. The robot draws
+its actions from the policy. With `action=mean` it takes the most likely action.
 """
 
 import importlib
@@ -92,35 +91,13 @@ def observe(
     """
     layout = trained.meta["observation"]
     seen = np.asarray(counts, float)
-    if trained.encoding != sensors["answers"]:
-        seen = ray(seen, sensors)
-        if trained.encoding == "metric":
-            seen = np.minimum(seen, trained.meta["sensors"]["range"])
-        else:
-            seen = np.interp(seen, sensors["distance"], sensors["counts"])
+    if trained.encoding == "metric":
+        seen = np.interp(seen, sensors["counts"][::-1], sensors["distance"][::-1])
+        seen = np.minimum(seen, trained.meta["sensors"]["range"])
     measured = dict(zip(QUANTITIES, [*seen, distance, bearing], strict=True))
     quantity = np.array([measured[name] for name in layout["names"]], np.float32)
     offset, scale = (np.array(layout[key], np.float32) for key in ("offset", "scale"))
     return (quantity - offset) / scale
-
-
-def ray(counts: np.ndarray, sensors: dict[str, Any]) -> np.ndarray:
-    """Converts counts to metres, as a robot with calibrated sensors does.
-
-    Args:
-      counts: [K] counts of the sensors.
-      sensors: contents of `sensors.json`.
-
-    Returns:
-      [K] distances at which nominal sensors report these counts, m.
-    """
-    if sensors["answers"] == "webots":
-        return np.interp(counts, sensors["counts"][::-1], sensors["distance"][::-1])
-    fit = {key: np.array(value) for key, value in sensors["fit"].items()}
-    echo = np.clip(counts, 1.0, fit["span"])
-    return np.clip(
-        np.sqrt(fit["strength"] / echo) - fit["depth"] + fit["to_hull"], 0.0, fit["reach"]
-    )
 
 
 def to_target(
@@ -254,11 +231,11 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
     sensors = json.loads((folder / "sensors.json").read_text())
     period = control_period(trained, robot.getBasicTimeStep())
     devices = find_devices(robot, period)
-    given, draw = parse(words), np.random.default_rng()
+    draw = np.random.default_rng()
     stops, parked_at = trained.meta["task"]["arrival"] == "latch", None
     memory, pursued = None, None
     while robot.step(period) != -1:  # the first step gives all sensors a value
-        orders = parse([*_custom(robot, given), *words])
+        orders = parse([*robot.getCustomData().split(), *words])
         wheels = np.zeros(len(MOTORS))
         if (orders.target, orders.robot) != pursued:  # an episode begins
             rows = 1 if trained.is_shared else orders.robot + 1
@@ -277,15 +254,6 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
                 wheels, memory = wheel_speeds(trained, seen, orders.robot, normal, memory)
         for motor, speed in zip(devices.motors, wheels, strict=True):
             motor.setVelocity(float(speed))
-
-
-def _custom(robot: Any, given: Orders) -> list[str]:
-    """Returns the words of customData.
-
-    If controllerArgs name the target, other programs may use customData, so only `robot=` counts.
-    """
-    words = robot.getCustomData().split()
-    return [word for word in words if given.target is None or word.startswith("robot=")]
 
 
 def main() -> int:

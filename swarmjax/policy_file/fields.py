@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from swarmjax.policy import FORMAT, PolicyError
-from swarmjax.policy_file.reach import check_reach
 
 ACTION_NAMES = ("speed", "turn_rate")
 ACTION_UNITS = ("m/s", "rad/s")
@@ -19,7 +18,6 @@ _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
 _SMALLEST = float(np.finfo(np.float32).tiny)
 _MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
-_MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
 _NEIGHBOUR_SIZE = 4  # entries of a neighbour: whether there is one, distance, cosine, sine
 _OWN_ARRAY = re.compile(NETWORK + r"(\w{1,64}/){0,8}\w{1,64}", re.ASCII)
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
@@ -141,10 +139,7 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
         "memory.size": _whole(1, 1024),
     },
     "observation.neighbours": {
-        "observation.neighbours": _Rule(
-            "an object without message_size, which c5cd6da is the last commit to read",
-            lambda value: _OBJECT.holds(value) and "message_size" not in value,
-        ),
+        "observation.neighbours": _OBJECT,
         "observation.neighbours.count": _whole(1, 32),
         "observation.neighbours.range": _POSITIVE,
     },
@@ -180,7 +175,6 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     _check_observation(meta)
     _check_action(meta["action"])
     _check_arrays(arrays, meta)
-    check_reach(arrays, _hidden_layers(arrays, meta), meta, _neighbours(meta))
 
 
 def _value(meta: Mapping[str, Any], field: str) -> Any:
@@ -201,7 +195,7 @@ def _check_fields(meta: Mapping[str, Any], rules: Mapping[str, _Rule]) -> None:
 
 
 def _check_observation(meta: Mapping[str, Any]) -> None:
-    """Checks that the lists of the layout fit each other and the neighbours."""
+    """Checks that the lists of the layout fit each other."""
     layout, names = meta["observation"], meta["observation"]["names"]
     if not names or len(set(names)) < len(names):
         raise PolicyError(
@@ -216,17 +210,6 @@ def _check_observation(meta: Mapping[str, Any]) -> None:
     _check_fields(meta, {"observation.offset": rule, "observation.scale": rule})
     if not np.array(layout["scale"], np.float32).all():
         raise PolicyError("meta.observation.scale holds 0, but it is a divisor.")
-    size = _neighbours(meta) * _NEIGHBOUR_SIZE
-    if size > len(names):
-        raise PolicyError(
-            f"meta.observation.neighbours takes {size} entries, but meta.observation.names "
-            f"has {len(names)}: expected names to include the neighbours' entries."
-        )
-
-
-def _neighbours(meta: Mapping[str, Any]) -> int:
-    """Returns how many neighbours a robot observes."""
-    return meta["observation"].get("neighbours", {"count": 0})["count"]
 
 
 def _check_action(layout: Mapping[str, Any]) -> None:
@@ -254,11 +237,6 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> 
                 f"{short_json(name)} is not known: format {FORMAT} has no such array."
             )
         _check_array(name, array, shapes[name])
-    if (arrays["actor/log_std"] > _MOST_LOG_STD).any():
-        raise PolicyError(
-            f"actor/log_std holds a value above {_MOST_LOG_STD:g}: expected the logarithm of a "
-            "deviation."
-        )
     if (arrays["normalizer/std"] < _SMALLEST).any():
         raise PolicyError(
             f"normalizer/std holds a value below {_SMALLEST:.3g}, but it is a divisor, and devices "
@@ -271,8 +249,6 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise PolicyError(f"{name} is {array.dtype}: expected float32.")
     if array.shape != shape:
         raise PolicyError(f"{name} has shape {list(array.shape)}: expected {list(shape)}.")
-    if not array.size:
-        raise PolicyError(f"{name} has shape {list(array.shape)}: expected no axis of length 0.")
     if not np.isfinite(array).all():
         raise PolicyError(f"{name} holds a value that is not finite: expected numbers.")
 
@@ -301,8 +277,9 @@ def _shapes(
         shapes[f"actor/{layer}/bias"] = (learners, width)
         return width
 
-    depth, neighbours = _hidden_layers(arrays, meta), _neighbours(meta)
-    if neighbours:
+    depth = _hidden_layers(arrays, meta)
+    if "neighbours" in meta["observation"]:
+        neighbours = meta["observation"]["neighbours"]["count"]
         width += add("hearing", _NEIGHBOUR_SIZE) - neighbours * _NEIGHBOUR_SIZE
     if "network" in meta:  # its layers come first, and only they know how many features they give
         own = {name: array for name, array in arrays.items() if _OWN_ARRAY.fullmatch(name)}

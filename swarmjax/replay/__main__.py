@@ -32,7 +32,6 @@ from swarmjax.config import ConfigError
 from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.replay import page as replay_page
-from swarmjax.replay import record
 from swarmjax.replay import video as replay_video
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.episodes import replay
@@ -60,10 +59,6 @@ def main(arguments: Sequence[str]) -> int:
             report = partial(progress.advance, bar)
             replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
-    for each in entrants:
-        weights = record.weights(each.policy, settings.task).extra
-        if missing := ", ".join(name for name, weight in weights.items() if weight):
-            sys.stdout.write(f"{each.path}: the rewards leave out {missing}\n")
     labels = "; ".join(episode.label for episode in episodes)
     sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
     if video:

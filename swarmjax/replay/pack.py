@@ -19,13 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.config import ConfigError
 from swarmjax.replay.record import Recording, ReplayEpisode
 
 LENGTH = 2e-4  # m; positions are off by at most half of it
 ANGLE = 1e-3  # rad; headings are off by at most half of it
 RAY = 5e-4  # m; a ray is shown with the middle of its interval
-MOST = 1 << 30  # largest number of quanta; differences of such numbers fold to 32 bits
 REWARD = 1e-4  # quantum of each reward term, summed since the start
 # Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
@@ -51,7 +49,7 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
         listed.append(_describe(episode) | {"runs": []})
         for recording in episode.runs:
             columns = _columns(recording, reach)
-            packed = {name: fold(name, table) for name, table in columns.items()}
+            packed = {name: fold(table) for name, table in columns.items()}
             tables += [planes for planes, _ in packed.values()]
             listed[-1]["runs"].append(
                 _describe_run(recording)
@@ -63,25 +61,15 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
     return zlib.compress(b"".join([len(text).to_bytes(4, "little"), text, *tables]), 9)
 
 
-def fold(name: str, table: np.ndarray) -> tuple[bytes, int]:
+def fold(table: np.ndarray) -> tuple[bytes, int]:
     """Packs one series.
 
     Args:
-      name: Name of the series.
-      table: [N, C] whole numbers of any type, with absolute values below `MOST`.
+      table: [N, C] whole numbers of any type; their differences fold to 32 bits.
 
     Returns:
       The bytes, and the number of bytes per number, 1 to 4.
-
-    Raises:
-      ConfigError: If a number is too large.
     """
-    largest = np.abs(table).max()
-    if not largest < MOST:
-        raise ConfigError(
-            f"{name} is too large for a replay: it reaches {largest:.3g} of its quanta, "
-            f"and a replay can store less than {MOST:.3g}."
-        )
     steps = np.diff(table.astype(np.int64), axis=0, prepend=0).T.ravel()
     folded = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype("<u4")
     width = max(1, (int(folded.max()).bit_length() + 7) // 8)

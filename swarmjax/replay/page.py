@@ -74,21 +74,13 @@ def _levels(settings: ReplayConfig) -> str:
 
 
 def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
-    """States how the episodes were made and how precisely they are shown, one fact per line."""
+    """States how the episodes were made, one fact per line."""
     names = zip(settings.policies, policies, strict=True)
     versions = provenance.versions()
-    length, angle = 1e3 * pack.LENGTH, pack.ANGLE
     return [
         *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
         ("levels", _choice(settings)),
         ("time", f"control steps of {settings.task.control_step:g} s"),
-        ("reward", "by the weights that the policy was trained with"),
-        (
-            "precision",
-            f"errors of at most {length / 2:g} mm for positions, {angle / 2:g} rad for headings, "
-            f"{500 * pack.RAY:g} mm for rays and {pack.REWARD / 2:g} for the sum of each reward "
-            "term",
-        ),
         ("versions", ", ".join(f"{name} {versions[name]}" for name in _SOFTWARE)),
         ("made by", words),
     ]
@@ -99,7 +91,4 @@ def _choice(settings: ReplayConfig) -> str:
     origin = f"of seed {settings.seed}" if settings.suite is None else f"of {_levels(settings)}"
     if settings.worst is None:
         return origin
-    return (
-        f"the {settings.worst} worst levels of {settings.policies[0]} {origin}, worst first: "
-        "fewest targets reached, then most contacts, then longest"
-    )
+    return f"the {settings.worst} worst levels of {settings.policies[0]} {origin}, worst first"

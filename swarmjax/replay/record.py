@@ -5,7 +5,7 @@ Only shortest paths need JAX.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,32 +38,45 @@ class ReplayScene:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recording:
-    """A recorded episode. N is the number of control steps plus one: row 0 is the start.
+class Frames:
+    """What robots do in N frames, perhaps of A arenas. Frame 0 is the start.
+
+    Attributes:
+      pose: [N, A, R, 3] x (m), y (m), yaw (rad); recordings have no axis A.
+      ray: [N, A, R, K] length of each infrared ray, m; at most the range of the electronics.
+      distance: [N, A, R] to the target, m.
+      touching: [N, A, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
+      arrived: [N, A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
+        within its target.
+      contacts: [N, A, R, 3] contacts so far of each kind.
+    """
+
+    pose: np.ndarray
+    ray: np.ndarray
+    distance: np.ndarray
+    touching: np.ndarray
+    arrived: np.ndarray
+    contacts: np.ndarray
+
+    def take(self, rows: Any) -> "Frames":
+        """Indexes all fields."""
+        return Frames(**{name: field[rows] for name, field in vars(self).items()})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording(Frames):
+    """A recorded episode: frames without the axis A, of one more than the control steps.
 
     Attributes:
       scene: The parts that do not move.
-      pose: [N, R, 3] x (m), y (m), yaw (rad).
-      ray: [N, R, K] length of each infrared ray, m; at most the sensor's range.
-      distance: [N, R] to the target, m.
       reward: [N, R] weighted reward of the step that led here, by term. It is 0 at the start
         and, with `task.arrival=latch`, after arrival.
-      touching: [N, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
-      contacts: [N, R, 3] contacts so far of each kind.
-      arrived: [N, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
-        within its target.
       arrival: [R] control steps until the robot arrived, 0 if it never did; with `hold`, until
         it was within its target for good.
     """
 
     scene: ReplayScene
-    pose: np.ndarray
-    ray: np.ndarray
-    distance: np.ndarray
     reward: Mapping[str, np.ndarray]
-    touching: np.ndarray
-    contacts: np.ndarray
-    arrived: np.ndarray
     arrival: np.ndarray
 
 
@@ -79,26 +92,6 @@ class ReplayEpisode(NamedTuple):
     label: str
     level: int
     runs: list[Recording]
-
-
-class Frame(NamedTuple):
-    """All arenas after a control step. Several frames have a leading axis N.
-
-    Attributes:
-      pose: [A, R, 3] x (m), y (m), yaw (rad).
-      ray: [A, R, K] ray lengths up to the range of the electronics, m.
-      distance: [A, R] to the target, m.
-      touching: [A, R, 3] whether the robot touches something of each kind.
-      arrived: [A, R] whether the robot has arrived; with `hold`, whether it is within its target.
-      contacts: [A, R, 3] contacts so far of each kind.
-    """
-
-    pose: np.ndarray
-    ray: np.ndarray
-    distance: np.ndarray
-    touching: np.ndarray
-    arrived: np.ndarray
-    contacts: np.ndarray
 
 
 def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
@@ -136,37 +129,31 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
         memory, action = engine_c.act(judge, memory, arenas)
         arenas = engine_c.step(judge, arenas, action)
         frames.append(_look(judge, arenas))
-        over |= frames[-1].arrived.all(axis=-1)
-    every = Frame(*(np.stack(field) for field in zip(*frames, strict=True)))
+        over |= arenas.outcome.arrived.all(axis=-1)
+    every = Frames(**{name: np.stack([each[name] for each in frames]) for name in frames[0]})
     return [
-        _cut(
-            Frame(*(field[:, i] for field in every)),
-            level,
-            _scene(level, mount, i),
-            judge,
-            earning,
-        )
+        _cut(every.take(np.s_[:, i]), level, _scene(level, mount, i), judge, earning)
         for i, level in enumerate(levels)
     ]
 
 
-def _look(judge: Judge, arenas: Arenas) -> Frame:
-    """Takes a frame of all arenas."""
+def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
+    """Takes a frame of all arenas: the fields of `Frames` without the axis N."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
     )
-    return Frame(
-        pose=arenas.pose,
-        ray=sight.ray,
-        distance=sight.distance,
-        touching=contacts.touching(judge, arenas.data),
-        arrived=arenas.outcome.arrived,
-        contacts=arenas.outcome.contacts,
-    )
+    return {
+        "pose": arenas.pose,
+        "ray": sight.ray,
+        "distance": sight.distance,
+        "touching": contacts.touching(judge, arenas.data),
+        "arrived": arenas.outcome.arrived,
+        "contacts": arenas.outcome.contacts,
+    }
 
 
 def _cut(
-    frames: Frame,
+    frames: Frames,
     level: Level,
     scene: ReplayScene,
     judge: Judge,
@@ -174,7 +161,7 @@ def _cut(
 ) -> Recording:
     """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
     task, over = judge.config.task, frames.arrived.all(axis=-1)
-    frames = Frame(*(field[: over.argmax() + 1 if over.any() else None] for field in frames))
+    frames = frames.take(np.s_[: over.argmax() + 1 if over.any() else None])
     before = frames.arrived[:-1]
     active, present = arrival.drives(task.arrival, before), np.ones_like(before)
     steps = reward.Step(
@@ -193,17 +180,12 @@ def _cut(
     earned = reward.weighted(steps, earning)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
+        **vars(frames) | {"ray": np.minimum(frames.ray, task.sensor_range)},
         scene=scene,
-        pose=frames.pose,
-        ray=np.minimum(frames.ray, task.sensor_range),
-        distance=frames.distance,
         reward={
             name: np.concatenate([none, np.where(active, term, 0.0)])
             for name, term in earned.items()
         },
-        touching=frames.touching,
-        contacts=frames.contacts,
-        arrived=frames.arrived,
         arrival=_since(frames.arrived),
     )
 

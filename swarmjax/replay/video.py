@@ -5,7 +5,6 @@ true sizes. Targets are discs of their radius on the floor.
 """
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -32,8 +31,6 @@ _MARGIN = 1.06  # around the arena
 _WALL = 0.015  # m; half of a wall's drawn thickness
 _FLAT = 5e-4  # m; half height of a target
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
-_TOUCHING = (0.9, 0.0, 0.1, 1.0)
-_HIDDEN = (0.0, 0.0, 0.0, 0.0)
 
 
 def check() -> None:
@@ -46,19 +43,13 @@ def check() -> None:
         import imageio_ffmpeg
 
         imageio_ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError):
-        raise ConfigError(
-            "video needs imageio and its ffmpeg, which are not installed: "
-            "install the extra, as in uv sync --extra video."
-        ) from None
-    try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # GLFW warns about what the error below explains
             mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
-    except Exception:  # each platform's library raises its own errors
+    except Exception as error:  # each platform's library raises its own errors
         raise ConfigError(
-            f"video needs OpenGL, but MUJOCO_GL={os.environ.get('MUJOCO_GL', '')} does not work on "
-            "this machine: set MUJOCO_GL=egl (Debian's libegl1) or MUJOCO_GL=osmesa (libosmesa6)."
+            f"video cannot be made here ({type(error).__name__}): install the extra, as in uv sync "
+            "--extra video, and set MUJOCO_GL=egl (Debian's libegl1) or osmesa (libosmesa6)."
         ) from None
 
 
@@ -132,8 +123,6 @@ class _Shot:
         self.camera = mujoco.MjvCamera()
         self.camera.azimuth, self.camera.elevation = 90.0, -math.degrees(ELEVATION)
         self.camera.distance = camera_distance(recording.scene.side, width / HEIGHT)
-        robots = range(recording.pose.shape[1])
-        self.rings = [self.model.geom(f"robot{i}_ring").id for i in robots]
 
     def draw(self, row: int) -> np.ndarray:
         """Draws one row of the recording; after its end, the last row."""
@@ -142,8 +131,6 @@ class _Shot:
         self.data.mocap_pos[:, :2] = pose[:, :2]
         self.data.mocap_quat[:, 0] = np.cos(0.5 * pose[:, 2])
         self.data.mocap_quat[:, 3] = np.sin(0.5 * pose[:, 2])
-        touching = self.recording.touching[row].any(axis=-1)
-        self.model.geom_rgba[self.rings] = np.where(touching[:, None], _TOUCHING, _HIDDEN)
         mujoco.mj_forward(self.model, self.data)
         self.renderer.update_scene(self.data, self.camera)
         return self.renderer.render()
@@ -168,8 +155,8 @@ def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
     for (x, y), colour in zip(recording.scene.target, colours, strict=True):
         size = [settings.task.target_radius, _FLAT, 0.0]
         _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
-    for i, colour in enumerate(colours):
-        _add_robot(spec, f"robot{i}", settings.robot.hull_radius, colour)
+    for colour in colours:
+        _add_robot(spec, settings.robot.hull_radius, colour)
     return spec
 
 
@@ -187,17 +174,15 @@ def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
         _add(spec.worldbody, _BOX, [*edges, HALF_HEIGHT], [x, y, HALF_HEIGHT], grey, yaw)
 
 
-def _add_robot(spec: mujoco.MjSpec, name: str, radius: float, colour: list[float]) -> None:
-    """Adds a robot: its hull with an arrow ahead, and a ring that shows contacts."""
-    body = spec.worldbody.add_body(name=name, mocap=True)
+def _add_robot(spec: mujoco.MjSpec, radius: float, colour: list[float]) -> None:
+    """Adds a robot: its hull with an arrow ahead."""
+    body = spec.worldbody.add_body(mocap=True)
     half, top = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM), epuck.HULL_TOP
     _add(body, _CYLINDER, [radius, half, 0], [0, 0, half + epuck.HULL_BOTTOM], colour)
     for side in (1.0, -1.0):
         # Two bars form the head of the arrow.
         place = [0.18 * radius, side * 0.24 * radius, top]
         _add(body, _BOX, [0.4 * radius, 0.09 * radius, 1e-3], place, yaw=-side * 0.65)
-    ring = _add(body, _CYLINDER, [1.2 * radius, 1e-3, 0], [0, 0, 2e-3], list(_HIDDEN))
-    ring.name = f"{name}_ring"
 
 
 def _add(

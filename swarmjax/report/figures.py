@@ -9,10 +9,9 @@ import math
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from swarmjax.pages import figures as drawing
@@ -20,7 +19,7 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 
 _POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
-_NAMED = 24  # stages named along a colour strip; more names would overlap
+_NAMED = 24  # stages named in the legend of the mix; more names would take the figure's place
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _STEPS = "arena control steps per seed"
 _CURVES = {
@@ -69,7 +68,9 @@ def mix(history: History) -> Figure:
     axes.set_ylabel("share of the arenas" + (f", mean of {seeds} seeds" if seeds > 1 else ""))
     axes.xaxis.set_major_formatter(drawing.thousands())
     axes.yaxis.set_major_formatter(drawing.percent())
-    _name_colours(figure, axes, names)
+    every = math.ceil(len(names) / _NAMED)
+    rows = range(len(names) - 1, -1, -every)  # from the top; always names the last stage, the goal
+    drawing.explain(figure, [Patch(color=colours[i], label=names[i]) for i in rows], 6)
     return figure
 
 
@@ -139,19 +140,6 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
     there = np.add.reduceat(~np.isnan(values), starts, axis=1)
     sums = np.add.reduceat(np.nan_to_num(values), starts, axis=1)
     return steps[ends - 1], np.where(there, sums / np.maximum(there, 1), np.nan)
-
-
-def _name_colours(figure: Figure, axes: Axes, names: list[str]) -> None:
-    """Adds a colour strip that names the bands in their order."""
-    count = len(names)
-    norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
-    strip = ScalarMappable(norm, colormaps["viridis"].resampled(count))
-    every = math.ceil(count / _NAMED)
-    ticks = list(range(count - 1, -1, -every))  # always names the last stage, the goal
-    bar = figure.colorbar(strip, ax=axes, ticks=ticks, spacing="uniform", aspect=30, pad=0.02)
-    bar.ax.set_yticklabels([names[i] for i in ticks], fontsize=9 if count <= 12 else 7)
-    bar.ax.tick_params(length=0)
-    bar.outline.set_visible(False)
 
 
 def _mark(panel: Axes, history: History, stage: int) -> None:

@@ -1,6 +1,7 @@
 """Builds the page of a report: one self-contained HTML file with its figures inside."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,15 @@ from swarmjax.report.rows import History, Row
 STYLES = (builder.STYLE, "report/report.css")
 
 
-def page(title: str, command: str, history: History, figures: Mapping[str, bytes]) -> str:
+def page(
+    title: str,
+    command: str,
+    history: History,
+    figures: Mapping[str, bytes],
+    template: str = "report/report.html",
+    styles: Sequence[str] = STYLES,
+    **values: Any,
+) -> str:
     """Lays out the page.
 
     Args:
@@ -21,24 +30,28 @@ def page(title: str, command: str, history: History, figures: Mapping[str, bytes
       command: the command that makes the report.
       history: the run's history.
       figures: PNG files by the names of the captions in `report.html`.
+      template: the template of the page; it extends `report.html`.
+      styles: names of its style sheets.
+      values: further values for the template.
 
     Returns:
       HTML with every name from the run escaped.
     """
     return builder.render(
-        "report/report.html",
-        styles=STYLES,
+        template,
+        styles=styles,
         title=title,
         command=command,
-        about=facts(history),
+        about=_facts(history),
         is_wide=len(history.names) > report_rows.MANY,
         figures=figures,
         decisions=_decisions(history),
         stages=_stages(history),
+        **values,
     )
 
 
-def facts(history: History) -> list[tuple[str, str]]:
+def _facts(history: History) -> list[tuple[str, str]]:
     """States what the run is and its results, one fact per line.
 
     Args:

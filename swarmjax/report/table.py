@@ -23,16 +23,7 @@ from swarmjax.run.settings import TrainConfig
 
 # Runs on one line may differ in these settings: which seeds they have, and how they ran.
 _APART = ("seed", "seeds", "seeds_by", "devices", "streams", "resume", "run")
-HEADS = (
-    "runs",
-    "settings",
-    "last stage",
-    "updates",
-    "seeds",
-    "success",
-    "95 % interval",
-    "train (s)",
-)
+HEADS = ("runs", "settings", "last stage", "updates", "seeds", "success", "95 %", "train (s)")
 
 
 class TableLine(NamedTuple):
@@ -109,7 +100,8 @@ def read(runs: Sequence[Path]) -> list[TableLine]:
     groups: dict[str, list[tuple[Path, History]]] = {}
     for run in runs:
         history = rows.read(run)
-        groups.setdefault(json.dumps(_settings(history)), []).append((run, history))
+        shared = {k: v for k, v in to_dict(history.config).items() if k not in _APART}
+        groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
     return [
         join(group, _differences(each, flat))
@@ -140,23 +132,14 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
     Raises:
       ConfigError: if two of them share a seed.
     """
-    owner: dict[int, Path] = {}
-    for run, history in group:
-        for seed in history.seeds.tolist():
-            if seed in owner:
-                raise ConfigError(
-                    f"seed {seed} is in {owner[seed]} and in {run}, which have the same settings: "
-                    "give one of them."
-                )
-            owner[seed] = run
     histories = [history for _, history in group]
-    success = {
-        int(seed): float(share)
-        for history in histories
-        for seed, share in zip(history.seeds, history.success[:, -1, -1], strict=True)
-    }
-    seeds = sorted(success)
-    measured = np.array([success[seed] for seed in seeds if not math.isnan(success[seed])])
+    every = [seed for history in histories for seed in history.seeds.tolist()]
+    if len(set(every)) < len(every):
+        places = " and ".join(str(run) for run, _ in group)
+        raise ConfigError(f"{places} have the same settings and share a seed: give one of them.")
+    shares = [share for history in histories for share in history.success[:, -1, -1].tolist()]
+    success = dict(sorted(zip(every, shares, strict=True)))
+    measured = np.array([share for share in success.values() if not math.isnan(share)])
     seconds = [history.seconds for history in histories if history.seconds is not None]
     config, several = histories[0].config, len(measured) >= LEAST_DRAWN
     return TableLine(
@@ -165,18 +148,13 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
         stage=config.stage[-1].name,
         updates=min(int(each.updates[-1]) + 1 for each in histories),
         budget=config.updates,
-        seeds=seeds,
-        success=[None if math.isnan(success[seed]) else success[seed] for seed in seeds],
+        seeds=list(success),
+        success=[None if math.isnan(share) else share for share in success.values()],
         measure=rows.measure(histories[0]),
         mean=float(measured.mean()) if len(measured) else None,
         interval=list(bootstrap(measured[:, None], np.mean)[1:]) if several else None,
         train_s=math.fsum(seconds) if len(seconds) == len(group) else None,
     )
-
-
-def _settings(history: History) -> dict[str, Any]:
-    """Takes the settings that runs must share to be joined into one line."""
-    return {key: value for key, value in to_dict(history.config).items() if key not in _APART}
 
 
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
@@ -191,26 +169,25 @@ def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) ->
     return " ".join(words)
 
 
-def cells(lines: Sequence[TableLine]) -> list[tuple[str, ...]]:
-    """Writes lines as text in the columns of `HEADS`."""
-    return [
-        (
-            _place(line.runs),
-            line.settings or "-",
-            line.stage,
-            f"{line.updates:,} of {line.budget:,}",
-            _seeds(line),
-            "-" if line.mean is None else f"{100.0 * line.mean:.1f} %",
-            "-" if line.interval is None else "{:.1%} to {:.1%}".format(*line.interval),
-            "-" if line.train_s is None else f"{line.train_s:,.1f}",
-        )
-        for line in lines
-    ]
+def cells(line: TableLine) -> tuple[str, ...]:
+    """Writes a line as text in the columns of `HEADS`."""
+    first, count = line.runs[0], len(line.runs)
+    seeds, unmeasured = len(line.seeds), line.success.count(None)
+    return (
+        first if count == 1 else f"{count} in {os.path.commonpath(line.runs)}",
+        line.settings or "-",
+        line.stage,
+        f"{line.updates:,} of {line.budget:,}",
+        f"{seeds}, {seeds - unmeasured} measured" if unmeasured else str(seeds),
+        "-" if line.mean is None else f"{100.0 * line.mean:.1f} %",
+        "-" if line.interval is None else "{:.1%} to {:.1%}".format(*line.interval),
+        "-" if line.train_s is None else f"{line.train_s:,.1f}",
+    )
 
 
 def text(lines: Sequence[TableLine]) -> str:
     """Writes lines as a table for a terminal, with a note about success and its interval."""
-    table = [HEADS, *cells(lines)]
+    table = [HEADS, *map(cells, lines)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     written = (
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -222,14 +199,3 @@ def text(lines: Sequence[TableLine]) -> str:
         f"95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
     )
     return "\n".join([*written, note])
-
-
-def _place(runs: Sequence[str]) -> str:
-    """Names a run; for several runs, their common folder and how many they are."""
-    return runs[0] if len(runs) == 1 else f"{len(runs)} in {os.path.commonpath(runs)}"
-
-
-def _seeds(line: TableLine) -> str:
-    """Writes the number of seeds, and how many have a success if not all do."""
-    of, measured = len(line.seeds), len(line.seeds) - line.success.count(None)
-    return str(of) if measured == of else f"{of}, {measured} measured"

@@ -30,7 +30,6 @@ COMMANDS: dict[str, Command] = {
     "reproduce": Command(
         "swarmjax.reproduce.config:ReproduceConfig", "Repeat the study of the paper."
     ),
-    "suite": Command("swarmjax.suite:SuiteConfig", "Draw the levels that policies are judged on."),
     "watch": Command("swarmjax.watch.config:WatchConfig", "Follow a run on a page."),
 }
 

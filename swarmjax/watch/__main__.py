@@ -10,26 +10,21 @@ Examples:
   python -m swarmjax.watch run=runs/first port=8000
 """
 
-import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from swarmjax import command
 from swarmjax.config import files
 from swarmjax.watch.config import WatchConfig
+from swarmjax.watch.live_page import LivePage
+from swarmjax.watch.server import Server
 
 
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; Ctrl-C ends it."""
     settings = files.load(WatchConfig, arguments)
-    os.environ["JAX_PLATFORMS"] = "cpu"  # reading checkpoints needs no GPU; leave it to the run
-    from swarmjax.watch.server import Server
-    from swarmjax.watch.view import Views
-
-    views = Views(settings)
-    views.draw()
-    with Server(settings.port, views) as server:
-        views.follow()
+    with Server(settings.port, LivePage(Path(settings.run))) as server:
         sys.stdout.write(f"{server.url} follows {settings.run}; Ctrl-C ends it.\n")
         sys.stdout.flush()
         server.serve_forever()

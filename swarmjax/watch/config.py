@@ -14,8 +14,3 @@ class WatchConfig(Section):
 
     run: str = field(metadata=about("run directory"))
     port: int = setting(0, "port of the page, on 127.0.0.1; 0: any free port", 0, 2**16 - 1)
-    extensions: str | None = setting(
-        None,
-        "Python file with the pieces that the run was trained with; it is executed; "
-        "null: a policy that needs such pieces is not replayed",
-    )

@@ -1,4 +1,4 @@
-"""Serves the page, its data, its figures and its replay to a browser on this machine.
+"""Serves the page of a run to a browser on this machine.
 
 No request reads from disk, so no path leads to a file. Only this machine can connect. A foreign
 page may redirect its own name to this address (DNS rebinding), but its requests carry that name as
@@ -6,21 +6,18 @@ Host and are refused. Without rebinding it cannot read answers either, since no 
 another origin.
 """
 
-import json
 import sys
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 
 from swarmjax.config import ConfigError
-from swarmjax.pages import builder
-from swarmjax.watch.view import Views
+from swarmjax.watch.live_page import LivePage
 
 ADDRESS = "127.0.0.1"
-# The page may load only from its own server: the requests of its script, and the replay's frame.
-_SOURCES = {"img-src": "'self' data:", "connect-src": "'self'", "frame-src": "'self'"}
+RENEW_S = 5  # the browser loads the page again after this many seconds
 _HEADERS = {
     "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -33,20 +30,13 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, port: int, views: Views) -> None:
+    def __init__(self, port: int, page: LivePage) -> None:
         """Opens the port; 0 means any free port.
 
         Raises:
           ConfigError: if the port is not available.
         """
-        self.views = views
-        self.page = builder.render(
-            "watch/watch.html",
-            styles=(builder.STYLE, "watch/watch.css"),
-            script=builder.read("watch/watch.js"),
-            sources=_SOURCES,
-            title=f"Watching {views.run}",
-        )
+        self.page = page
         try:
             super().__init__((ADDRESS, port), Answers)
         except OSError as error:
@@ -79,36 +69,19 @@ class Answers(BaseHTTPRequestHandler):
     timeout = _SILENT_S
 
     def do_GET(self) -> None:  # the name that the library calls; it refuses other methods
-        """Answers with the content at a path."""
+        """Answers with the page."""
         if self.headers.get_all("Host") not in [[host] for host in self.server.hosts]:
-            text = f"Open {self.server.url}\n".encode()
-            self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", text)
-            return
-        answer = self._find(self.path.partition("?")[0])
-        if answer is None:
-            self._send(HTTPStatus.NOT_FOUND, "text/plain", b"There is no such page.\n")
-            return
-        self._send(HTTPStatus.OK, *answer)
+            self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", f"Open {self.server.url}\n")
+        elif self.path.partition("?")[0] != "/":
+            self._send(HTTPStatus.NOT_FOUND, "text/plain", "There is no such page.\n")
+        else:
+            self._send(HTTPStatus.OK, "text/html; charset=utf-8", self.server.page.html())
 
-    def _find(self, path: str) -> tuple[Any, ...] | None:
-        """Returns type, content and perhaps framing policy of a page; None if there is none."""
-        views = self.server.views
-        html = "text/html; charset=utf-8"
-        if path == "/":
-            return html, self.server.page.encode()
-        if path == "/state.json":
-            return "application/json", json.dumps(views.state()).encode()
-        if path == "/replay.html" and views.replay:
-            return html, views.replay.encode(), "frame-ancestors 'self'"
-        figures = {f"/figures/{name}.png": png for name, png in views.figures.items()}
-        return ("image/png", figures[path]) if path in figures else None
-
-    def _send(
-        self, status: HTTPStatus, kind: str, content: bytes, framing: str = "frame-ancestors 'none'"
-    ) -> None:
+    def _send(self, status: HTTPStatus, kind: str, text: str) -> None:
+        content = text.encode()
         self.send_response(status)
-        about = {"Content-Type": kind, "Content-Length": str(len(content))}
-        for name, value in (about | _HEADERS | {"Content-Security-Policy": framing}).items():
+        about = {"Content-Type": kind, "Content-Length": str(len(content)), "Refresh": str(RENEW_S)}
+        for name, value in (about | _HEADERS).items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(content)

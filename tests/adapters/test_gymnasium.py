@@ -131,14 +131,6 @@ def test_step_needs_a_reset(swarm: Swarm) -> None:
         SwarmVectorEnv(swarm).step(np.zeros((6, 2), np.float32))
 
 
-@pytest.mark.parametrize(
-    "given", [{"seed": [1, 2]}, {"seed": -1}, {"options": {"reset_mask": np.ones(6, bool)}}]
-)
-def test_a_reset_that_cannot_be_is_refused(envs: SwarmVectorEnv, given: dict) -> None:
-    with pytest.raises(gymnasium.error.Error):
-        envs.reset(**given)
-
-
 def test_a_closed_one_is_of_no_use(closed: SwarmVectorEnv) -> None:
     closed.close()  # a second close does nothing
     with pytest.raises(gymnasium.error.ResetNeeded):

@@ -41,8 +41,6 @@ def test_what_playground_asks(env: SwarmMjxEnv) -> None:
     assert (env.observation_size, env.action_size, env.episode_length) == (20, 4, LIMIT)
     assert (env.dt, env.n_substeps) == (0.032, env.robots.swarm.world.physics.substeps)
     assert env.mj_model.nbody > 2
-    with pytest.raises(NotImplementedError):
-        env.render([])
 
 
 def test_it_follows_the_course(states: list, arena_course: Course) -> None:

@@ -20,7 +20,6 @@ from swarmjax.replay.config import ReplayConfig
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.run.settings import TrainConfig
-from swarmjax.suite import SuiteConfig
 from swarmjax.watch.config import WatchConfig
 
 STAGE = {"name": "s1", "robots": 1, "side": 1.0}
@@ -33,7 +32,6 @@ COMMANDS: dict[type[Section], dict[str, Any]] = {
     ReportConfig: {"run": "a"},
     WatchConfig: {"run": "a"},
     ReproduceConfig: {},
-    SuiteConfig: {"suite": "dev"},
     SuiteFileConfig: {"name": "mine", "cells": [CELL]},
 }
 EXTREMES = [1e300, -1e300, 1e-300, -1e-300, 1e39, 1e-39, 2**31, 2**63, -(2**63), 10**5000]

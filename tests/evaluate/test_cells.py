@@ -117,33 +117,23 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda a: a.pop("meta"), "meta.format is not 2"),
-        (_set("meta", np.array("{")), "meta.format is not 2"),
+        (lambda a: a.pop("meta"), "meta cannot be read as JSON"),
+        (_set("meta", np.array("{")), "meta cannot be read as JSON"),
         (_meta(lambda m: m.update(format=1)), "meta.format is not 2"),
         (_meta(lambda m: m.pop("cells")), "meta.cells is null: give a list"),
         (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names one more than"),
-        (_meta(lambda m: m["cells"].pop()), "some/episode is unknown: meta.cells lists no such"),
         (_meta(lambda m: m["cells"][0].update(x=1)), "meta.cells one: x is not a key"),
         (
             _meta(lambda m: m["cells"][0]["stage"].update(robots=0)),
             "meta.cells one: stage.robots is",
         ),
         (_meta(lambda m: m["cells"][0].update(seed=1)), "meta.cells one: seed is 1: give"),
-        (_meta(lambda m: m["cells"][0].update(digest=None)), "cell one: digest is missing."),
-        (_meta(lambda m: m["cells"][0].update(digest="0" * 64)), "cell one of the file has the "),
-        (_set("one/other", np.zeros(3)), "one/other is unknown"),
-        (lambda a: a.pop("two/target"), "two/target is missing."),
-        (_set("one/seed", np.zeros(3, np.int32)), "one/seed is int32 [3]: expected uint32 [3]."),
-        (_set("one/start", np.zeros((3, 2, 2), np.float32)), "one/start is float32 [3, 2, 2]: "),
-        (_edit("one/start", 0, np.nan), "one/start holds numbers that are not finite."),
-        (_edit("one/start", 0, 0.3), "cell one: start lies outside the walls."),
-        (_edit("one/target", 0, -0.3), "cell one: target lies outside the walls."),
-        (_edit("one/side", 0, 0.6), "cell one: side is outside [0.5,0.5] m."),
-        (_edit("one/present", 0, False), "cell one: present is not all true."),
-        (_edit("two/obstacle", (0, 0, 3), 0.0), "cell two: obstacle has half edges of 0 or less."),
-        (_edit("two/obstacle", (0, 0, 3), 9.0), "cell two: obstacle is longer than the largest "),
-        (_edit("two/obstacle_present", (0, 0), False), "cell two: obstacle is not present, but "),
-        (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two of the file has the digest "),
+        (_meta(lambda m: m["cells"][0].update(digest="0" * 64)), "cell one has the digest "),
+        (lambda a: a.pop("two/target"), "two/target is not finite float32 [2, 3, 2]."),
+        (_set("one/seed", np.zeros(3, np.int32)), "one/seed is not finite uint32 [3]."),
+        (_set("one/start", np.zeros((3, 2, 2), np.float32)), "one/start is not finite float32 "),
+        (_edit("one/start", 0, np.nan), "one/start is not finite float32 [3, 2, 3]."),
+        (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two has the digest "),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(
@@ -155,7 +145,7 @@ def test_a_file_that_is_unsound_is_refused(
         arrays = dict(archive)
     change(arrays)
     np.savez(path, **arrays)
-    assert refusal(cells.read, path).startswith(f"suite {path}: {reason}")
+    assert refusal(cells.read, path).startswith(f"suite {path} cannot be read: {reason}")
 
 
 def test_a_file_that_is_compressed_is_refused(tmp_path: Path) -> None:
@@ -281,7 +271,6 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
         (_text("name: a, stage: s1, seed: 5"), "seed is 5: give 1000000 to 2147483647."),
         (_text("name: a, stage: s1, seed: 1000000, shape: ball"), "shape is 'ball': give box, "),
         (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1]"), "levels is 2, but"),
-        (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1, 1]"), "episodes holds"),
         (_text("name: a b, stage: s1, seed: 1000000"), "name is 'a b': give letters, digits"),
         (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells names a more than once"),
         (_text("name: a, stage: {robots: 2, side: 0.3}, seed: 1000000"), "stage.side is 0.3: "),
@@ -297,9 +286,11 @@ def test_a_suite_that_is_unsound_is_refused(tmp_path: Path, text: str, reason: s
 def test_a_digest_that_is_off_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "suite.yaml"
     cell = "name: here, stage: s1, levels: 2, seed: 1000000"
+    path.write_text(_text(cell))
+    assert cells.draw(str(path)).cells[0].name == "here"
     path.write_text(_text(f"{cell}, digest: {'a' * 64}"))
     sentence = refusal(cells.draw, str(path))
-    assert sentence.startswith("cell here of suite tiny has the digest ")
+    assert sentence.startswith("cell here has the digest ")
     assert "but aaaaaaaaaaaa... is recorded: the levels differ." in sentence
 
 

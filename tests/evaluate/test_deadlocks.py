@@ -18,7 +18,6 @@ def _level(arrived: list[bool], still: list[int]) -> Outcome:
         arrival=none,
         contacts=kinds,
         touched=kinds,
-        impulse=kinds,
         sensed=none,
         moving=none,
         path=none,

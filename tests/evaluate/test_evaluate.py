@@ -83,7 +83,7 @@ def test_standing_still_reaches_nothing(tmp_path: Path) -> None:
     path = steering.write(tmp_path / "policy.npz", STAY)
     settings = _config(path, stage=_stage(2), episodes=5, steps=160)
     found = {name: each["mean"] for name, each in _measures(settings).items()}
-    for name in ("targets_reached", "all_reached", "spl", "contacts_per_robot", "impulse_ns_wall"):
+    for name in ("targets_reached", "all_reached", "spl", "contacts_per_robot", "contact_s_wall"):
         assert found[name] == 0.0
     # 160 control steps are 5.12 s, which is long enough for a deadlock and ends in a time-out.
     assert found["deadlocks"] == found["time_outs"] == 1.0

@@ -21,7 +21,6 @@ def _outcome() -> Outcome:
         arrival=np.array([[4, 10], [6, 0], [0, 0]]),
         contacts=contacts,
         touched=touched,
-        impulse=0.5 * contacts,
         sensed=np.array([[1, 2], [3, 4], [0, 15]]),
         moving=np.array([[4, 10], [6, 20], [30, 30]]),
         path=np.array([[0.5, 1.0], [0.25, 3.0], [0.0, 2.0]]),
@@ -50,10 +49,6 @@ def test_per_level_by_hand() -> None:
         "contact_s_robot": [0.15, 0.0, 0.15],
         "contact_s_obstacle": [0.0, 0.0, 0.3],
         "contact_s_wall": [0.3, 0.0, 0.0],
-        "impulse_ns_per_robot": [0.75, 0.0, 0.75],
-        "impulse_ns_robot": [0.25, 0.0, 0.25],
-        "impulse_ns_obstacle": [0.0, 0.0, 0.5],
-        "impulse_ns_wall": [0.5, 0.0, 0.0],
         "ir_steps_share": [3 / 14, 7 / 26, 15 / 60],
         # A robot is in a deadlock after 50 steps (5 s) at rest, unless it has arrived.
         "deadlocks": [0.0, 0.5, 0.5],
@@ -64,11 +59,9 @@ def test_per_level_by_hand() -> None:
         np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
 
 
-def test_what_an_engine_does_not_tell_is_left_out() -> None:
-    outcome = _outcome()._replace(impulse=np.full((3, 2, 3), np.nan))
-    found = measures.per_level(outcome, STEP, STEPS)
-    missing = set(MEASURES) - set(found)
-    assert missing == {"spl", *(name for name in MEASURES if name.startswith("impulse"))}
+def test_without_shortest_paths_there_is_no_path_efficiency() -> None:
+    found = measures.per_level(_outcome(), STEP, STEPS)
+    assert set(MEASURES) - set(found) == {"spl"}
 
 
 @pytest.mark.parametrize(
@@ -84,7 +77,7 @@ def test_what_an_engine_does_not_tell_is_left_out() -> None:
 def test_path_efficiency(arrived: bool, shortest: float, driven: float, expected: float) -> None:
     one = _outcome()._replace(arrived=np.array([[arrived]]), path=np.array([[driven]]))
     one = one._replace(**{n: getattr(one, n)[:1, :1] for n in ("arrival", "sensed", "moving")})
-    one = one._replace(**{n: getattr(one, n)[:1, :1] for n in ("contacts", "touched", "impulse")})
+    one = one._replace(**{n: getattr(one, n)[:1, :1] for n in ("contacts", "touched")})
     one = one._replace(clock=one.clock[:1], still=one.still[:1, :1])
     found = measures.per_level(one, STEP, STEPS, np.array([[shortest]]))
     np.testing.assert_allclose(found["spl"], [expected])

@@ -141,7 +141,6 @@ def test_export_refuses(
         (): "run is null and policy is null: give one of them, as in run=runs/a or",
         (given, "out=copy.npy"): "out is copy.npy, but format is npz: end it in .npz.",
         (given, "format=onnx", "out=a"): "out is a, but format is onnx: end it in .onnx.",
-        (given, "format=webots", "out=a b"): "out is a b, whose name is also the controller's: ",
         (given, "format=c", f"out={tmp_path / 'file'}"): "which cannot be written: ",
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",

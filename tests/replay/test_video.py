@@ -78,11 +78,10 @@ def test_without_opengl_or_ffmpeg_it_says_what_to_install(monkeypatch):
         raise RuntimeError
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
-    monkeypatch.setenv("MUJOCO_GL", "glfw")
-    with pytest.raises(ConfigError, match=r"^video needs OpenGL, but MUJOCO_GL=glfw does not "):
+    with pytest.raises(ConfigError, match=r"^video cannot be made here .* set MUJOCO_GL=egl "):
         video.check()
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ConfigError, match=r"^video needs imageio .* uv sync --extra video\.$"):
+    with pytest.raises(ConfigError, match=r"^video cannot be made here .* uv sync --extra video"):
         video.check()
 
 
@@ -106,8 +105,6 @@ except ConfigError:
 video.HEIGHT, video.HOLD = 240, 0.1
 run = replays.wandering(2, 4)
 run.pose[:, :, :2] = run.scene.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
-run.ray[:], run.touching[:] = 0.04, False
-run.touching[:, 1] = True
 settings = load_levels(ReplayConfig, ["policy=a", "task.control_step=0.064"])
 out = Path(sys.argv[1])
 video.write(out, settings, [replays.episode(run, run)])
@@ -140,11 +137,6 @@ def test_a_film_shows_the_robots(tmp_path):
     assert count == 6 + 3
     assert picture.shape == (240, 2 * 320, 3)
     for half in (picture[:, :320], picture[:, 320:]):
-        red = (half[..., 0] > 120) & (half[..., 1:].max(axis=-1) < 80)
-        rows, columns = np.nonzero(red)  # the ring of robot 1, upper right
-        assert len(rows) > 10
-        assert rows.mean() < 120
-        assert columns.mean() > 160
         blue = (half[..., 2] > 100) & (half[..., 2] > 2 * half[..., 0])
         rows, columns = np.nonzero(blue)  # robot 0, lower left
         assert len(rows) > 50

@@ -58,7 +58,7 @@ def test_the_mix_is_stacked_as_the_mean_over_seeds(tmp_path: Path) -> None:
     assert set(low[low[:, 0] == 128][:, 1]) == {0.0, 0.75}
     assert set(high[high[:, 0] == 128][:, 1]) == {0.75, 1.0}
     assert axes.get_xlim() == (0, 128)
-    names = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    names = [label.get_text() for label in figure.legends[0].get_texts()]
     assert sorted(names) == ["pair", "trio"]
 
 
@@ -74,10 +74,10 @@ def test_many_updates_are_averaged_and_none_is_left_out(tmp_path: Path) -> None:
     assert (heights < 1.0).mean() > 0.4  # half of the outline is the lower edge
 
 
-def test_names_on_the_strip_are_thinned_from_the_last(tmp_path: Path) -> None:
+def test_names_in_the_legend_are_thinned_from_the_last(tmp_path: Path) -> None:
     stages = _stages([(2, 0, 0.5 + 0.01 * i) for i in range(48)])
     figure = report_figures.mix(_history(tmp_path, [_wide_row([None] * 48)], stages))
-    names = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    names = [label.get_text() for label in figure.legends[0].get_texts()]
     assert names == [stage.name for stage in stages][::-2]
 
 

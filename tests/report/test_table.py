@@ -100,7 +100,7 @@ def test_a_seed_that_was_not_measured_has_no_part_in_the_mean(tmp_path: Path) ->
     (line,) = table.read([write(tmp_path, _rows(0.5, None, 0.7))])
     assert line.mean == pytest.approx(0.6)
     assert line.interval is None
-    assert table.cells([line])[0][4] == "3, 2 measured"
+    assert table.cells(line)[4] == "3, 2 measured"
     (none,) = table.read([write(tmp_path, _rows(None))])
     assert (none.mean, none.success) == (None, [None])
 

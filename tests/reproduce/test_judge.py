@@ -42,7 +42,6 @@ def test_a_row_is_computed_from_all_episodes(
             arrival=zero,
             contacts=np.array([[[1, 0, 0], [0, 2, 0]], [[0, 0, 3], [0, 0, 0]]]),
             touched=np.zeros((2, 2, 3)),
-            impulse=np.zeros((2, 2, 3)),
             sensed=np.array([[5, 5], [0, 20]]),
             moving=np.array([[10, 10], [20, 20]]),
             path=zero,

@@ -307,8 +307,6 @@ def test_export_refuses_an_unknown_format():
         (["policy=p", "format=c", "step=1"], "step is 1, but policy is one file: give step with "
          "run."),
         (["policy=p"], "out is null, but policy is already an npz file: give out=FILE."),
-        (["run=r", "format=onnx", "sensors=real"], "sensors is real, but format is onnx: give "
-         "format=webots."),
     ],
 )  # fmt: skip
 def test_export_refuses(words, sentence):

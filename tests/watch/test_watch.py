@@ -16,15 +16,14 @@ import pytest
 from runs import CONFIG, row, write
 
 from swarmjax import command
-from swarmjax.config import ConfigError
 from swarmjax.config.section import ByName
-from swarmjax.report import rows
+from swarmjax.report import figures, rows
 from swarmjax.run import directory
 from swarmjax.watch import __main__ as watch
-from swarmjax.watch import newest, status
+from swarmjax.watch import live_page, status
 from swarmjax.watch.config import WatchConfig
+from swarmjax.watch.live_page import LivePage
 from swarmjax.watch.server import Server
-from swarmjax.watch.view import Views
 
 UPDATES = CONFIG.updates
 
@@ -36,10 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(run: Path) -> Iterator[Server]:
-    """Yields a server whose figures are drawn once and never renewed."""
-    views = Views(WatchConfig(run=str(run)))
-    views.draw()
-    with Server(0, views) as made:
+    with Server(0, LivePage(run)) as made:
         threading.Thread(target=made.serve_forever, daemon=True).start()
         yield made
         made.shutdown()
@@ -64,23 +60,18 @@ def test_it_listens_on_the_loopback_alone(server: Server) -> None:
     assert server.server_address[0] == "127.0.0.1"
 
 
-@pytest.mark.parametrize(
-    ("path", "kind"),
-    [
-        ("/", "text/html; charset=utf-8"),
-        ("/?a=b", "text/html; charset=utf-8"),
-        ("/state.json", "application/json"),
-        ("/figures/success.png", "image/png"),
-        ("/figures/mix.png?2", "image/png"),
-    ],
-)
-def test_what_there_is_is_answered_and_not_kept(server: Server, path: str, kind: str) -> None:
+@pytest.mark.parametrize("path", ["/", "/?a=b"])
+def test_the_page_is_answered_and_not_kept(server: Server, path: str) -> None:
     status, headers, content = _ask(server, path)
-    assert (status, headers["Content-Type"]) == (200, kind)
+    assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
     assert headers["Cache-Control"] == "no-store"
     assert headers["X-Content-Type-Options"] == "nosniff"
     assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
-    assert content
+    assert headers["Refresh"] == "5"
+    page = content.decode()
+    assert "It has stopped after 2 of 20 updates." in page
+    assert 'id="success"' in page
+    assert "<script" not in page
 
 
 @pytest.mark.parametrize(
@@ -93,8 +84,6 @@ def test_what_there_is_is_answered_and_not_kept(server: Server, path: str, kind:
         "/%2e%2e/config.json",
         "//etc/passwd",
         "/figures/../../../../etc/passwd.png",
-        "/figures/curves.png",  # a figure that these rows do not produce
-        "/replay.html",  # no replay is made yet
         "http://127.0.0.1/",
         "*",
     ],
@@ -109,7 +98,7 @@ def test_no_path_leads_elsewhere(server: Server, path: str) -> None:
 )
 def test_a_request_that_was_meant_for_another_host_is_refused(server: Server, host: str) -> None:
     host = host.format(port=server.server_port)
-    assert _ask(server, "/state.json", host=host)[0] == 421
+    assert _ask(server, "/", host=host)[0] == 421
 
 
 def test_localhost_is_this_machine(server: Server) -> None:
@@ -127,41 +116,38 @@ def test_the_name_of_a_run_is_text(server: Server) -> None:
     assert "a <b>" not in content
 
 
-@pytest.mark.slow
-def test_a_line_that_is_half_written_is_left_out(tmp_path: Path) -> None:
-    run = write(tmp_path / "run", [row(0), row(1)])
-    with (run / "metrics.jsonl").open("a") as file:
-        file.write(json.dumps(row(2))[:40])
-    views = Views(WatchConfig(run=str(run)))
-    views.draw()
-    assert views.history is not None
-    assert views.history.updates.tolist() == [0, 1]
-    assert views.state()["trouble"] == ""
+def test_a_run_without_an_update_has_a_page(tmp_path: Path) -> None:
+    page = LivePage(write(tmp_path / "run", []))
+    assert "It has stopped after 0 of 20 updates." in page.html()
 
 
-@pytest.mark.slow
-def test_a_damaged_line_is_told_and_what_was_drawn_stays(tmp_path: Path) -> None:
-    run = write(tmp_path / "run", [row(0)])
-    views = Views(WatchConfig(run=str(run)))
-    views.draw()
-    with (run / "metrics.jsonl").open("a") as file:
+def test_figures_are_drawn_anew_when_there_is_more_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[int] = []
+    monkeypatch.setattr(figures, "png_files", lambda h: drawn.append(len(h.updates)) or {})
+    monkeypatch.setattr(live_page, "SHARE", 1.0)  # never rests
+    page = LivePage(write(tmp_path / "run", [row(0)]))
+    page.html()
+    page.html()
+    write(page.run, [row(0), row(1)])
+    with (page.run / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps(row(2))[:40])  # half written
+    page.html()
+    assert drawn == [1, 2]
+    assert page.trouble == ""
+
+
+def test_a_damaged_line_is_told_and_what_was_drawn_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_page, "SHARE", 1.0)  # never rests
+    page = LivePage(write(tmp_path / "run", [row(0)]))
+    page.html()
+    with (page.run / "metrics.jsonl").open("a") as file:
         file.write("{}\n")
-    views.draw()
-    state = views.state()
-    assert "in line 2" in state["trouble"]
-    assert "success" in state["figures"]["names"]
-
-
-@pytest.mark.slow
-def test_figures_are_drawn_anew_when_there_is_more_alone(tmp_path: Path) -> None:
-    run = write(tmp_path / "run", [row(0)])
-    views = Views(WatchConfig(run=str(run)))
-    views.draw()
-    views.draw()
-    assert views.drawing["version"] == 1
-    write(run, [row(0), row(1)])
-    views.draw()
-    assert views.drawing["version"] == 2
+    assert "in line 2" in page.html()
+    assert "success" in page.figures
 
 
 # How a run stands
@@ -241,9 +227,6 @@ def test_a_process_that_has_ended_is_not_writing(
     assert directory.is_written(tmp_path) is is_written
 
 
-# The newest policy
-
-
 def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     mark = tmp_path / "ran"
     own = tmp_path / "own.py"
@@ -252,13 +235,7 @@ def test_code_that_a_run_names_is_not_run(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(0)], trained=replace(CONFIG, pieces=pieces))
     stored = json.loads((run / "config.json").read_text()) | {"extensions": str(own)}
     (run / "config.json").write_text(json.dumps(stored))
-    views = Views(WatchConfig(run=str(run)))
-    views.draw()
-    with pytest.raises(
-        ConfigError,
-        match=r"^the stored run .* the reward mine of",
-    ):
-        newest.record(views.settings, views.history)
+    LivePage(run).html()
     assert not mark.exists()
 
 

@@ -1,40 +1,57 @@
 /* A robot's policy: from its observation to its motion. C99, float only, no heap.
  *
  * Written by swarmjax.export; has the same numbers as policy.npz with digest
- * $digest.
- * $kind
+ * {{ policy.digest }}.
+ * {{ 'All robots share it.' if policy.is_shared else '%s policies, one for each robot.' % policy.mean | length }}
  *
  * Observation, each entry (quantity - offset) / scale:
  *
-$observation
+{% for name, unit, offset, scale in entries %}
+ *   [{{ loop.index0 }}] {{ "%-20s %-8s" | format(name, unit) }} offset {{ offset | short }}, scale {{ scale | short }}
+{% endfor %}
  *
  * Command, each entry within low and high:
  *
-$action
+{% for name in meta.action.names %}
+{% set i = loop.index0 %}
+ *   {{ "%-20s %-8s" | format(name, meta.action.units[i]) }} {{ meta.action.low[i] | short }} to {{ meta.action.high[i] | short }}
+{% endfor %}
  *
- * Trained for: $trained,
- * a command every $control_step s.
+ * Trained for: {{ trained }},
+ * a command every {{ meta.task.control_step | short }} s.
  */
 #ifndef POLICY_H
 #define POLICY_H
 
-#define POLICY_OBSERVATIONS $observations
-#define POLICY_ACTIONS $actions
-#define POLICY_LEARNERS $learners
+#define POLICY_OBSERVATIONS {{ entries | length }}
+#define POLICY_ACTIONS {{ meta.action.names | length }}
+#define POLICY_LEARNERS {{ policy.mean | length }}
 
-#define POLICY_DIGEST "$digest"
-#define POLICY_CONTROL_STEP $control_step_f /* s */
-#define POLICY_TARGET_RADIUS $target_radius_f /* m, distance to the target that counts as arrival */
-#define POLICY_HOLDS $holds /* 1: it keeps driving within that distance; 0: stop the robot there for good */
+#define POLICY_DIGEST "{{ policy.digest }}"
+#define POLICY_CONTROL_STEP {{ meta.task.control_step | float32 }} /* s */
+#define POLICY_TARGET_RADIUS {{ meta.task.target_radius | float32 }} /* m, distance to the target that counts as arrival */
+#define POLICY_HOLDS {{ 1 if meta.task.arrival == 'hold' else 0 }} /* 1: it keeps driving within that distance; 0: stop the robot there for good */
 
-$memory_type/* Scales quantities, in the units above, to an observation. */
+{% if memory %}
+#define POLICY_MEMORY {{ memory }}
+
+/* The memory of a robot. */
+typedef struct {
+    float recalled[POLICY_MEMORY];
+} PolicyMemory;
+
+/* Clears the memory, as at the start of an episode. */
+void policy_begin(PolicyMemory *memory);
+
+{% endif %}
+/* Scales quantities, in the units above, to an observation. */
 void policy_observe(const float quantity[POLICY_OBSERVATIONS],
                     float observation[POLICY_OBSERVATIONS]);
 
 /* Computes the most likely action; -1..1 spans the commands, but it may lie beyond. `learner` is
  * the robot's number, modulo POLICY_LEARNERS: any number will do if all robots share the policy. */
 void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
-                   ${memory_parameter}float action[POLICY_ACTIONS]);
+                   {{ "PolicyMemory *memory, " if memory else "" }}float action[POLICY_ACTIONS]);
 
 /* Draws an action from the policy around the most likely one, as in evaluation. `normal` are
  * standard normal numbers, independent of each other and of earlier ones. Random actions free
@@ -47,7 +64,7 @@ void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
 void policy_command(const float action[POLICY_ACTIONS], float command[POLICY_ACTIONS]);
 
 /* Turns a command into the speeds of the left and the right wheel (rad/s), each within its limit:
- * wheel radius $wheel_radius m, track $track m, limit $max_wheel_speed rad/s. */
+ * wheel radius {{ meta.robot.wheel_radius | short }} m, track {{ meta.robot.track | short }} m, limit {{ meta.robot.max_wheel_speed | short }} rad/s. */
 void policy_wheel_speeds(const float command[POLICY_ACTIONS], float wheels[2]);
 
 #endif

@@ -2,21 +2,18 @@
  * of the first one that does not. It has no input or output, so it also runs on the robot. */
 #include "policy.h"
 
-#define CASES $cases
+#define CASES {{ cases.ACTION | length }}
 #define TOLERANCE 1e-5f /* times 1 or the action, whichever is larger */
 
-static const float OBSERVATION[CASES][POLICY_OBSERVATIONS] = {
-$observation
+{% for name, rows in cases.items() %}
+static const float {{ name }}[CASES][{{ "POLICY_OBSERVATIONS" if name == "OBSERVATION" else "POLICY_ACTIONS" }}] = {
+{% for row in rows %}
+{
+{{ row | floats }}
+},
+{% endfor %}
 };
-static const float ACTION[CASES][POLICY_ACTIONS] = {
-$action
-};
-static const float NORMAL[CASES][POLICY_ACTIONS] = {
-$normal
-};
-static const float SAMPLE[CASES][POLICY_ACTIONS] = {
-$sample
-};
+{% endfor %}
 
 static float magnitude(float x)
 {
@@ -37,9 +34,17 @@ static int agrees(const float *found, const float *expected)
 
 int main(void)
 {
-$memory_begin    for (int i = 0; i < CASES; i++) {
+{% if memory %}
+    PolicyMemory memory[POLICY_LEARNERS];
+{% endif %}
+    for (int i = 0; i < CASES; i++) {
         float action[POLICY_ACTIONS];
-$memory_reset        policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], ${memory_argument}action);
+{% if memory %}
+        if (i % (CASES / 2) < POLICY_LEARNERS) {
+            policy_begin(&memory[i % POLICY_LEARNERS]);
+        }
+{% endif %}
+        policy_action((unsigned)i % POLICY_LEARNERS, OBSERVATION[i], {% if memory %}&memory[i % POLICY_LEARNERS], {% endif %}action);
         if (!agrees(action, ACTION[i])) {
             return 1 + i;
         }

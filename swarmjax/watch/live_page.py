@@ -1,0 +1,82 @@
+"""Draws the page of a run: its status and its report, anew when the run has logged more."""
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from swarmjax import command
+from swarmjax.config import ConfigError
+from swarmjax.pages import builder
+from swarmjax.report import page as report_page
+from swarmjax.report import rows
+from swarmjax.report.rows import History
+from swarmjax.run.directory import METRICS
+from swarmjax.watch import status
+
+# Drawing takes at most this share of a core, so that it hardly slows down the run.
+SHARE = 0.2
+_TEMPLATE, _STYLES = "watch/watch.html", (*report_page.STYLES, "watch/watch.css")
+
+
+class LivePage:
+    """The page of a run.
+
+    Attributes:
+      run: The run directory.
+      trained: The run's config.
+      history: The results that the figures show; None before the first update.
+      figures: PNG files by name.
+      trouble: Why the newest drawing failed; empty if it did not.
+    """
+
+    def __init__(self, run: Path) -> None:
+        """Reads the run's config.
+
+        Raises:
+          ConfigError: There is no valid config.
+        """
+        self.run, self.trained = run, rows.read_config(run)
+        self.history: History | None = None
+        self.figures: dict[str, bytes] = {}
+        self.trouble = ""
+        self._drawn: tuple[int, float] | None = None
+        self._rests_until = 0.0
+        self._lock = threading.Lock()  # two browsers may ask at once
+
+    def html(self) -> str:
+        """Returns the page as it is now."""
+        with self._lock:
+            self._draw()
+            state, sentence = status.read(self.run, self.trained, self.history)
+            about: dict[str, Any] = {"state": state, "sentence": sentence, "trouble": self.trouble}
+            about |= {"styles": _STYLES, "has_trained": self.history is not None}
+            title = f"Watching {self.run}"
+            if self.history is None:
+                return builder.render(_TEMPLATE, title=title, **about)
+            made_by = command.line("watch", f"run={self.run}")
+            return report_page.page(title, made_by, self.history, self.figures, _TEMPLATE, **about)
+
+    def _draw(self) -> None:
+        """Draws the figures if the run has logged more, unless drawing must rest."""
+        version, began = _version(self.run / METRICS), time.monotonic()
+        if version in (None, self._drawn) or began < self._rests_until:
+            return
+        from swarmjax.report import figures  # Matplotlib takes a second
+
+        try:
+            self.history = rows.read(self.run)
+            self.figures, self.trouble = figures.png_files(self.history), ""
+        except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
+            self.trouble = str(error)
+        now = time.monotonic()
+        self._drawn, self._rests_until = version, now + (now - began) * (1.0 - SHARE) / SHARE
+
+
+def _version(path: Path) -> tuple[int, float] | None:
+    """Returns a file's size and time, to detect changes; None if it is missing or empty."""
+    try:
+        file = path.stat()
+    except OSError:
+        return None
+    return (file.st_size, file.st_mtime) if file.st_size else None
