@@ -28,10 +28,8 @@ def load(
     """
     name = resolve(config, networks)
     torso = {piece.name: piece.function for piece in networks}.get(name)
-    if torso is not None:
-        _check_torso(torso, name, observation)
-        if state:
-            _check_torso(torso, f"{name} for a critic of the state", observation + state)
+    for size in {observation, observation + state} if torso else ():
+        _check_torso(torso, name, size)
     return torso
 
 

@@ -4,13 +4,11 @@ The number of updates is an argument, so one program serves every chunk size. An
 the same run.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array
 
@@ -119,7 +117,8 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(program, trajectory, state.arenas.recall, ended)
-    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
+    steps = config.arenas * config.algo.rollout_length
+    explored = program.ppo.explore(state.learners, steps)
     learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
     curriculum = curricula.observe(
@@ -134,6 +133,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     )
     learners = carry_over(learners, program, state.curriculum, curriculum)
     before = state.curriculum.chosen
+    every_stage = jnp.arange(before.weights.shape[0])[:, None]
     metrics = {
         "update": state.update,
         "stage": before.stage,
@@ -141,7 +141,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
         **_learner_metrics(learned, batch, shards),
         **shards.sum(
             {
-                "mix": _mix(arenas.stage, before.weights.shape[0]),
+                "mix": jnp.sum(arenas.stage == every_stage, axis=-1, dtype=jnp.int32),
                 "robots": jnp.sum(arenas.level.present),
                 "transitions": jnp.sum(trajectory.valid),
                 **_episode_metrics(ended, before.stage),
@@ -181,40 +181,22 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    if len(learners.normalizer.count) > 1:
-        carried = _copied(carried, before.met, after.met)
-    if options.optimizer == "reset":
-        carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
-    if options.exploration == "reset":
-        carried = program.ppo.explore_anew(carried)
+    count = len(learners.normalizer.count)
+    if count > 1:  # learner i % before.met is copied to the place of learner i
+        index = jnp.arange(count)
+        new = (index >= before.met) & (index < after.met)
+        source = jnp.where(new, index % before.met, index)
+        carried = jax.tree.map(lambda x: x[source], learners)
+    carried = program.ppo.begin_again(
+        carried,
+        optimizer=options.optimizer == "reset",
+        exploration=options.exploration == "reset",
+    )
     if carried is learners:
         return learners
     reason = after.chosen.reason
     promoted = (reason == BY_THRESHOLD) | (reason == BY_BUDGET)
     return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
-
-
-def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState:
-    """Copies learner i % before to the place of learner i, for before <= i < after."""
-    index = jnp.arange(learners.normalizer.count.shape[0])
-    new = (index >= before) & (index < after)
-    source = jnp.where(new, index % before, index)
-    return jax.tree.map(lambda x: x[source], learners)
-
-
-def _forgotten(state: optax.OptState) -> optax.OptState:
-    """Sets Adam's moments, and the count that corrects their bias, to 0.
-
-    The learning rate's schedule has its own count and goes on.
-    """
-
-    def is_adam(part: object) -> bool:
-        return isinstance(part, optax.ScaleByAdamState)
-
-    def forget(part: optax.OptState) -> optax.OptState:
-        return jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part
-
-    return jax.tree.map(forget, state, is_leaf=is_adam)
 
 
 def _draw(
@@ -231,11 +213,6 @@ def _draw(
     return rollout.draw_starts(
         program.world, schedule.stages, following, cohort, key, shards, memory
     )
-
-
-def _mix(stage: Array, stages: int) -> Array:
-    """Counts the arenas on each stage, from the stage of each arena [A]."""
-    return jnp.sum(stage == jnp.arange(stages)[:, None], axis=-1, dtype=jnp.int32)
 
 
 def _curriculum_metrics(
