@@ -128,29 +128,18 @@ class AlgoConfig(Section):
         if not self.hidden_sizes:
             raise ConfigError("hidden_sizes is []: give at least one layer, as in [64,64].")
         check_options(self, _READ_BY)
-        self._check_memory()
         if self.exploration == "scheduled" and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
                 f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
             )
-        if self.mean_activation == "tanh" and self.activation != "tanh":
+        plain = self.activation == "tanh" and self.memory == "none"
+        if self.mean_activation == "tanh" and not plain:
             raise ConfigError(
-                f"mean_activation is tanh, but activation is {self.activation}, and a policy file "
-                "stores one activation for all layers: give activation=tanh or "
-                "mean_activation=linear."
+                f"mean_activation is tanh, but activation is {self.activation} and memory is "
+                f"{self.memory}: give activation=tanh and memory=none, or mean_activation=linear."
             )
-
-    def _check_memory(self) -> None:
-        """Refuses settings that a memory does not support."""
-        if self.memory == "none":
-            return
-        if self.mean_activation != "linear":
-            raise ConfigError(
-                f"mean_activation is {self.mean_activation}, but memory is {self.memory}: give "
-                "linear, or memory=none."
-            )
-        if self.network not in (None, "mlp"):
+        if self.memory != "none" and self.network not in (None, "mlp"):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "
                 "with hidden layers: give network=mlp or memory=none."

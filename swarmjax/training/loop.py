@@ -63,13 +63,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     curriculum = curricula.init(program.curriculum(schedule), schedule)
     starts = _draw(program, schedule, curriculum, level_key, waiting=1)
     learners = jax.vmap(program.ppo.init)(jax.random.split(learner_key, config.learners))
-    return TrainState(
-        learners=learners,
-        arenas=starts,
-        curriculum=curriculum,
-        key=run_key,
-        update=jnp.zeros((), jnp.int32),
-    )
+    return TrainState(learners, starts, curriculum, run_key, jnp.zeros((), jnp.int32))
 
 
 def train_chunk(
@@ -110,9 +104,9 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     Returns:
       The state after, and the metrics of this update.
     """
-    config, shards = program.config, program.shards
+    config, shards, before = program.config, program.shards, state.curriculum
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=program.waiting)
+    waiting = _draw(program, schedule, before, level_key, waiting=program.waiting)
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
@@ -121,44 +115,31 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     explored = program.ppo.explore(state.learners, steps)
     learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
+    loss = batches.value_loss(batch, ended.episodes > 0)
+    success = config.curriculum.success
     curriculum = curricula.observe(
-        program.curriculum(schedule),
-        schedule,
-        config.curriculum.success,
-        state.curriculum,
-        ended,
-        batches.value_loss(batch, ended.episodes > 0),
-        state.update,
-        shards,
+        program.curriculum(schedule), schedule, success, before, ended, loss, state.update, shards
     )
-    learners = carry_over(learners, program, state.curriculum, curriculum)
-    before = state.curriculum.chosen
-    every_stage = jnp.arange(before.weights.shape[0])[:, None]
+    learners = carry_over(learners, program, before, curriculum)
+    stage, every_stage = before.chosen.stage, jnp.arange(len(schedule.deadline))[:, None]
     metrics = {
         "update": state.update,
-        "stage": before.stage,
-        **_curriculum_metrics(config, state.curriculum, curriculum),
+        "stage": stage,
+        **_curriculum_metrics(config, before, curriculum),
         **_learner_metrics(learned, batch, shards),
         **shards.sum(
             {
                 "mix": jnp.sum(arenas.stage == every_stage, axis=-1, dtype=jnp.int32),
                 "robots": jnp.sum(arenas.level.present),
                 "transitions": jnp.sum(trajectory.valid),
-                **_episode_metrics(ended, before.stage),
+                **_episode_metrics(ended, stage),
             }
         ),
     }
     if program.by_robot:
         every = jax.tree.map(partial(shards.gather, axis=1), ended)
         metrics[episodes.KEY] = episodes.pack(every, episodes.room(config))
-    new = TrainState(
-        learners=learners,
-        arenas=arenas,
-        curriculum=curriculum,
-        key=key,
-        update=state.update + 1,
-    )
-    return new, metrics
+    return TrainState(learners, arenas, curriculum, key, state.update + 1), metrics
 
 
 def carry_over(
