@@ -30,7 +30,7 @@ from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
 from swarmjax.ppo.fast.blocks import valid_first
-from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
+from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Loss, Place, Samples, Tiles
 from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Params
 
@@ -58,7 +58,11 @@ METRICS = (
     "skipped_steps",
 )
 
-_Run = functools.partial[tuple[jax.Array, Metrics]]
+# What the kernel of each network reads of a sample.
+_READ = {
+    "actor": ("observation", "action", "log_prob", "advantage", "valid"),
+    "critic": ("observation", "return_", "valid"),
+}
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
 
 
@@ -199,9 +203,14 @@ def flat_gradient(
       the tiles, [].
     """
     share = 1.0 / jnp.maximum(expected_valid, 1.0)
-    run = functools.partial(kernel.sums, activation=config.activation, tiles=tiles, launch=launch)
-    actor, surrogate = _actor_sums(run, flat["actor"], layout["actor"], samples, config)
-    critic, error = _critic_sums(run, flat["critic"], layout["critic"], samples)
+
+    def run(name: str, loss: Loss) -> tuple[jax.Array, Metrics]:
+        read = {key: getattr(samples, key).astype(jnp.float32) for key in _READ[name]}
+        return kernel.sums(flat[name], layout[name], config.activation, loss, read, tiles, launch)
+
+    surrogate_loss = functools.partial(_surrogate, config, samples.action.shape[1])
+    actor, surrogate = run("actor", surrogate_loss)
+    critic, error = run("critic", _half_square)
     count = error.pop("valid")
     weight = count * share  # weight in the mean of a term that all samples share
     first, width = layout["actor"].vectors["log_std"]
@@ -213,23 +222,6 @@ def flat_gradient(
         "critic": critic * (config.value_cost * share),
     }
     return found, metrics, count
-
-
-def _actor_sums(
-    run: _Run, actor: jax.Array, layout: KernelLayout, samples: Batch, config: AlgoConfig
-) -> tuple[jax.Array, Metrics]:
-    """Sums the gradient of the surrogate, and metrics, over samples."""
-    loss = functools.partial(_surrogate, config, samples.action.shape[1])
-    names = ("observation", "action", "log_prob", "advantage", "valid")
-    return run(actor, layout, loss=loss, samples=_samples(samples, names))
-
-
-def _critic_sums(
-    run: _Run, critic: jax.Array, layout: KernelLayout, samples: Batch
-) -> tuple[jax.Array, Metrics]:
-    """Sums the gradient of half the squared error, that error and `valid` over samples."""
-    names = ("observation", "return_", "valid")
-    return run(critic, layout, loss=_half_square, samples=_samples(samples, names))
 
 
 def _with_entropy(
@@ -258,10 +250,6 @@ def _layout(network: Params, last: str) -> KernelLayout:
     )
     vectors = {name: (firsts[name], network[name].size) for name in network if name == "log_std"}
     return KernelLayout(tuple(places), vectors, ends[-1])
-
-
-def _samples(samples: Batch, names: tuple[str, ...]) -> Samples:
-    return {name: getattr(samples, name).astype(jnp.float32) for name in names}
 
 
 def _surrogate(
