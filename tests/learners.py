@@ -1,10 +1,12 @@
 """PPO and networks for tests, of settings and sizes alone."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import numpy as np
+import pytest
+from jax.experimental import pallas
 
 from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
@@ -24,6 +26,11 @@ def ppo(config: AlgoConfig, sizes: Sizes, updates: int = 10, backend: Backend | 
 def nets(config: AlgoConfig, observation: int, action: int, state: int = 0) -> Networks:
     """Returns actor and critic."""
     return networks.make(config, Sizes(observation, action, state))
+
+
+def interpret_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs Pallas kernels as ordinary JAX, on any device."""
+    monkeypatch.setattr(pallas, "pallas_call", partial(pallas.pallas_call, interpret=True))
 
 
 def moved(state: LearnerState) -> LearnerState:

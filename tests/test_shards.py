@@ -44,7 +44,9 @@ def test_moments_are_of_all_observations(samples: tuple[np.ndarray, np.ndarray])
 
 def test_returns_are_normalised_over_all_samples(samples: tuple[np.ndarray, np.ndarray]) -> None:
     values, valid = samples
-    found = _on_two(lambda x, v: batch.normalize_returns(x, v, TWO), values, valid).ravel()
+    found = _on_two(
+        lambda x, v: batch.normalize(x, v, TWO, ddof=1, epsilon=1e-7), values, valid
+    ).ravel()
     expected = (values - values[valid].mean()) / (values[valid].std(ddof=1) + 1e-7)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 

@@ -15,8 +15,6 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.shards import ALONE, Shards
 
-_EPSILON = 1e-7  # as in PPO-PyTorch
-
 
 class Trajectory(NamedTuple):
     """A learner's observations and actions and their results, [T, A, N, ...].
@@ -50,6 +48,8 @@ class Trajectory(NamedTuple):
 class Batch:
     """The samples of one update, in G groups of N. Invalid samples may hold anything, NaN included.
 
+    A minibatch has the same fields with one axis of samples, [B], and memory [S, H].
+
     Attributes:
       observation: [G, N, O], raw.
       action: [G, N, U], as drawn.
@@ -60,7 +60,7 @@ class Batch:
       valid: [G, N], bool or 0/1.
       memory: [G, S, H], memory of the S robots of a group before the rollout; () each without
         memory. With memory, the N samples of a group are ordered by step, [T S].
-      begins: [G, N], whether an episode begins with the step; () without memory.
+      begins: [G, N], whether an episode begins with the step; None without memory.
       state: [G, N, P], numbers of order 1 that the critic sees in addition; () if there are none.
     """
 
@@ -71,7 +71,7 @@ class Batch:
     return_: jax.Array
     valid: jax.Array
     memory: Recall = NO_MEMORY
-    begins: Any = ()
+    begins: jax.Array | None = None
     state: Any = ()
 
 
@@ -106,15 +106,16 @@ def make(
         )
     else:
         boundary = trajectory.terminated | trajectory.truncated
-        returns = monte_carlo_returns(trajectory.reward, boundary, discount=config.discount)
-        returns = normalize_returns(returns, trajectory.valid, shards)
+        # As `PPO.update` of PPO-PyTorch (nikhilbarhate99, commit 728cce8): nothing is bootstrapped.
+        returns = sum_back(trajectory.reward, boundary, config.discount)
+        returns = normalize(returns, trajectory.valid, shards, ddof=1, epsilon=1e-7)
         advantages = returns - trajectory.value
 
     def group(x: jax.Array) -> jax.Array:
         x = jnp.moveaxis(x, 0, 1)
         return x.reshape(x.shape[0], -1, *x.shape[3:])
 
-    begins = ()
+    begins = None
     if jax.tree.leaves(memory):
         first = jnp.concatenate([jnp.zeros_like(over[:1]), over[:-1]])
         begins = group(jnp.broadcast_to(first[..., None], trajectory.valid.shape))
@@ -141,21 +142,16 @@ def value_loss(batch: Batch, over: jax.Array) -> jax.Array:
     Returns:
       [T, A] mean of max(advantage, 0) over the transitions since the last end of an episode.
     """
-    steps = over.shape[0]
 
     def by_step(x: jax.Array) -> jax.Array:
-        return jnp.sum(x.reshape(*x.shape[:2], steps, -1), axis=(0, 3)).T
+        return jnp.sum(x.reshape(*x.shape[:2], len(over), -1), axis=(0, 3)).T
 
     positive = by_step(jnp.where(batch.valid, jnp.maximum(batch.advantage, 0.0), 0.0))
     valid = by_step(batch.valid.astype(jnp.float32))
-
-    def step(sums: tuple[jax.Array, jax.Array], now: tuple[jax.Array, ...]) -> Any:
-        total, count = sums[0] + now[0], sums[1] + now[1]
-        going_on = jnp.where(now[2], 0.0, total), jnp.where(now[2], 0.0, count)
-        return going_on, total / jnp.maximum(count, 1.0)
-
-    none = jnp.zeros_like(positive[0])
-    return jax.lax.scan(step, (none, none), (positive, valid, over))[1]
+    # Sums over the steps before are sums over the steps after, with time reversed.
+    begins = jnp.concatenate([jnp.ones_like(over[:1]), over[:-1]])
+    total, count = (sum_back(x[::-1], begins[::-1], 1.0)[::-1] for x in (positive, valid))
+    return total / jnp.maximum(count, 1.0)
 
 
 def generalized_advantages(
@@ -191,33 +187,21 @@ def generalized_advantages(
     terminated = terminated.astype(bool)
     ends = terminated | truncated.astype(bool)
     errors = rewards + discount * jnp.where(terminated, 0.0, next_values) - values
-    advantages = _sum_back(errors, ends, discount * gae_lambda)
+    advantages = sum_back(errors, ends, discount * gae_lambda)
     return advantages, advantages + values
 
 
-def monte_carlo_returns(reward: jax.Array, boundary: jax.Array, *, discount: float) -> jax.Array:
-    """Sums the discounted rewards from each step to the next boundary, time first.
-
-    As in PPO-PyTorch (nikhilbarhate99, commit 728cce8, `PPO.update`).
-
-    Nothing is bootstrapped: the sum ends at a boundary and at the end of the rollout, as if no more
-    rewards followed. If an episode ends without a boundary, the return goes on into the next
-    episode.
+def sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
+    """Sums discounted terms from each step to the next end, or to the end of the rollout.
 
     Args:
-      reward: [T, ...], reward of step t.
-      boundary: [T, ...], bool: the return of step t ends with the reward of this step.
-      discount: Per step, 0..1.
+      terms: [T, ...], term of step t.
+      ends: [T, ...], bool: the sum of step t ends with the term of this step.
+      factor: Discount per step, 0..1.
 
     Returns:
-      The returns, [T, ...].
+      [T, ...] the sum of the term and of the factor times the sum of the step after.
     """
-    chex.assert_equal_shape([reward, boundary])
-    return _sum_back(reward, boundary.astype(bool), discount)
-
-
-def _sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
-    """Adds to each term [T, ...] the factor times the sum of the step after, up to an end."""
 
     def add(following: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         term, end = step
@@ -227,22 +211,24 @@ def _sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
     return jax.lax.scan(add, jnp.zeros_like(terms[0]), (terms, ends), reverse=True)[1]
 
 
-def normalize_returns(returns: jax.Array, valid: jax.Array, shards: Shards = ALONE) -> jax.Array:
-    """Shifts and scales returns to mean 0 and deviation 1 over the valid samples.
-
-    The deviation is the unbiased one, which divides by N - 1, plus 1e-7.
+def normalize(
+    values: jax.Array, valid: jax.Array, shards: Shards = ALONE, *, ddof: int, epsilon: float
+) -> jax.Array:
+    """Shifts and scales values to mean 0 and deviation 1 over the valid samples.
 
     Args:
-      returns: [...].
+      values: [...].
       valid: [...], bool or 0/1.
       shards: How the samples are spread over devices.
+      ddof: The variance is divided by the number of samples minus this.
+      epsilon: Added to the deviation.
 
     Returns:
-      The normalised returns, [...], including those that are not valid.
+      The normalised values, [...], including those that are not valid.
     """
-    chex.assert_equal_shape([returns, valid])
+    chex.assert_equal_shape([values, valid])
     valid = valid.astype(bool)
     count = shards.sum(jnp.sum(valid))
-    mean = shards.sum(jnp.sum(jnp.where(valid, returns, 0.0))) / jnp.maximum(count, 1)
-    squares = shards.sum(jnp.sum(jnp.where(valid, (returns - mean) ** 2, 0.0)))
-    return (returns - mean) / (jnp.sqrt(squares / jnp.maximum(count - 1, 1)) + _EPSILON)
+    mean = shards.sum(jnp.sum(jnp.where(valid, values, 0.0))) / jnp.maximum(count, 1)
+    squares = shards.sum(jnp.sum(jnp.where(valid, (values - mean) ** 2, 0.0)))
+    return (values - mean) / (jnp.sqrt(squares / jnp.maximum(count - ddof, 1)) + epsilon)

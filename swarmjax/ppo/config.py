@@ -18,11 +18,6 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 }
 
 
-# Fewest control steps of a rollout that train a memory: a quarter of a second, in which a robot
-# drives about as far as it sees.
-LEAST_SEQUENCE = 8
-
-
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig(Section):
     """Settings of PPO; names in quotes are those in Table 1 of the paper.
@@ -99,14 +94,10 @@ class AlgoConfig(Section):
     )
     value_cost: float = setting(0.5, "weight of the value loss, half the mean squared error", 0.0)
     entropy_cost: float = setting(0.0, "weight of the entropy", 0.0)
-    bound_cost: float = setting(
-        1500.0, "weight of the squared distance of the mean action from -1..1", 0.0
-    )
-    update_backend: Literal["auto", "autodiff", "fused"] = setting(
+    update_backend: Literal["auto", "autodiff"] = setting(
         "auto",
-        "how to compute gradients; fused: GPU kernels, with minibatches of tiles of valid "
-        "samples; auto: fused on an NVIDIA GPU if the kernels support the layers; with a "
-        "memory, autodiff that leaves out the rollouts of absent robots",
+        "how to compute gradients; auto: by GPU kernels if there is an NVIDIA GPU and they "
+        "support the layers; with a memory, by autodiff without the rollouts of absent robots",
     )
     exploration: Literal["learned", "scheduled"] = setting(
         "learned", "deviation of the action: learned, or falling in steps by a schedule"
@@ -137,44 +128,18 @@ class AlgoConfig(Section):
         if not self.hidden_sizes:
             raise ConfigError("hidden_sizes is []: give at least one layer, as in [64,64].")
         check_options(self, _READ_BY)
-        self._check_memory()
-        if self.critic == "state" and self.update_backend == "fused":
-            raise ConfigError(
-                "update_backend is fused, but critic is state: give auto or autodiff, or "
-                "critic=observation."
-            )
         if self.exploration == "scheduled" and self.std_floor > self.initial_std:
             raise ConfigError(
                 f"std_floor is {show(self.std_floor)}, but initial_std is "
                 f"{show(self.initial_std)}: give at most {show(self.initial_std)}."
             )
-        if self.mean_activation == "tanh" and self.activation != "tanh":
+        plain = self.activation == "tanh" and self.memory == "none"
+        if self.mean_activation == "tanh" and not plain:
             raise ConfigError(
-                f"mean_activation is tanh, but activation is {self.activation}, and a policy file "
-                "stores one activation for all layers: give activation=tanh or "
-                "mean_activation=linear."
+                f"mean_activation is tanh, but activation is {self.activation} and memory is "
+                f"{self.memory}: give activation=tanh and memory=none, or mean_activation=linear."
             )
-
-    def _check_memory(self) -> None:
-        """Refuses settings that a memory does not support."""
-        if self.memory == "none":
-            return
-        if self.rollout_length < LEAST_SEQUENCE:
-            raise ConfigError(
-                f"rollout_length is {self.rollout_length}, but memory is {self.memory}, which is "
-                "trained through the steps of a rollout: give at least "
-                f"{LEAST_SEQUENCE}, or memory=none."
-            )
-        for key, only in (
-            ("update_backend", ("auto", "autodiff")),
-            ("mean_activation", ("linear",)),
-        ):
-            if getattr(self, key) not in only:
-                raise ConfigError(
-                    f"{key} is {getattr(self, key)}, but memory is {self.memory}: give "
-                    f"{' or '.join(only)}, or memory=none."
-                )
-        if self.network not in (None, "mlp"):
+        if self.memory != "none" and self.network not in (None, "mlp"):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "
                 "with hidden layers: give network=mlp or memory=none."

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import jax
 
-from swarmjax.config import ConfigError, show
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
+from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Networks, Sizes
 
 # XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
@@ -20,16 +20,15 @@ _FULL = ("highest", "float32", "F32_F32_F32")
 # autodiff: `ppo` alone. blocks: autodiff of a whole batch, block by block. fused: kernels.
 # sequences: autodiff of a policy with memory, without the sequences of absent robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
-Learn = Callable[[Learning, Progress, Minibatch, jax.Array], tuple[Progress, Metrics]]
+Learn = Callable[[Learning, Progress, Batch, jax.Array], tuple[Progress, Metrics]]
 
 
 def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
     """Chooses how updates are computed on the device that JAX computes on.
 
-    `auto` means `fused` on an NVIDIA GPU that supports the layers, but not if JAX computes matrix
-    products in full precision. Without tensor cores the kernels are slower than XLA's code. A CPU
-    processes a whole batch in `blocks`; an accelerator processes it at once. A policy with memory
-    is trained in `sequences` on any device.
+    `auto` means `fused` on a GPU that supports the kernels and for layers that the kernels support.
+    A CPU processes a whole batch in `blocks`; an accelerator processes it at once. A policy with
+    memory is trained in `sequences` on any device.
 
     Args:
       config: Settings of the learner.
@@ -38,13 +37,11 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
 
     Returns:
       The backend.
-
-    Raises:
-      ConfigError: The config asks for `fused`, but there is no such GPU or the layers do not fit.
     """
+    auto = config.update_backend == "auto"
     if config.memory != "none":  # the other faster ways handle single samples
-        return "sequences" if config.update_backend == "auto" else "autodiff"
-    if _fuses(config, networks, sizes):
+        return "sequences" if auto else "autodiff"
+    if auto and _fuses(config, networks, sizes):
         return "fused"
     whole = config.num_minibatches == 1 and jax.default_backend() == "cpu"
     return "blocks" if whole else "autodiff"
@@ -57,7 +54,7 @@ def memory_kernels(config: AlgoConfig) -> Any:
       config: Settings of the learner.
     """
     asked = config.memory != "none" and config.update_backend == "auto"
-    if not asked or not _has_tensor_cores() or _is_full_precision():
+    if not asked or not _runs_kernels():
         return None
     from swarmjax.ppo.fast import kernel, recurrence
 
@@ -70,43 +67,22 @@ def find(backend: Backend) -> Learn:
 
 
 def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
-    """Tells whether to use the kernels; refuses `fused` where they are not available."""
-    if config.update_backend == "autodiff" or config.critic == "state":
+    """Tells whether kernels may compute the update."""
+    plain = config.critic == "observation" and networks.actor.torso is None
+    # The kernels support no layer in front of the hidden ones.
+    if not plain or sizes.hearing is not None or not _runs_kernels():
         return False
-    if sizes.hearing is not None:  # the kernels support no layer in front of the hidden ones
-        return False
-    possible = _has_tensor_cores()
-    fitting = possible and networks.actor.torso is None and _fits(config, sizes)
-    if config.update_backend == "fused" and not possible:
-        raise ConfigError(
-            "algo.update_backend is fused, but there is no NVIDIA GPU of compute capability "
-            f"{_LEAST_GENERATION} or more: give auto or autodiff."
-        )
-    if config.update_backend == "fused" and not fitting:
-        raise ConfigError(
-            "algo.update_backend is fused, but the kernels do not support algo.hidden_sizes "
-            f"{show(config.hidden_sizes)} with {sizes.observation} observed numbers: give two "
-            "layers of 16, 32 or 64 and at most 128 numbers, or algo.update_backend=auto."
-        )
-    if config.update_backend == "auto" and _is_full_precision():
-        return False
-    return fitting
-
-
-def _fits(config: AlgoConfig, sizes: Sizes) -> bool:
-    """Tells whether the kernels support hidden layers of this size."""
     from swarmjax.ppo.fast import fused
 
     return fused.fits(config, sizes.observation, sizes.action)
 
 
-def _is_full_precision() -> bool:
-    """Tells whether JAX avoids tensor cores in matrix products; the kernels are slower then."""
-    return jax.config.jax_default_matmul_precision in _FULL
+def _runs_kernels() -> bool:
+    """Tells whether kernels are faster than XLA's code on the device that JAX computes on.
 
-
-def _has_tensor_cores() -> bool:
-    """Tells whether JAX computes on an NVIDIA GPU whose tensor cores Triton supports."""
+    They need an NVIDIA GPU whose tensor cores Triton supports, and products that may use them.
+    """
     capability = str(getattr(jax.devices()[0], "compute_capability", ""))
     generation = re.fullmatch(r"(\d+)\.\d+", capability)
-    return generation is not None and int(generation[1]) >= _LEAST_GENERATION
+    supported = generation is not None and int(generation[1]) >= _LEAST_GENERATION
+    return supported and jax.config.jax_default_matmul_precision not in _FULL

@@ -1,7 +1,5 @@
 """The schedule of exploration: the deviation of the action falls in steps, as in PPO-PyTorch."""
 
-from collections.abc import Iterator
-
 import jax
 import jax.numpy as jnp
 
@@ -21,19 +19,14 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
     Returns:
       At least one deviation, in action units.
     """
-    return tuple(_fall(config))
-
-
-def _fall(config: AlgoConfig) -> Iterator[float]:
-    std = config.initial_std
-    yield std
-    while std > config.std_floor:
-        lower = round(std - config.std_decrement, 4)
+    stds = [config.initial_std]
+    while stds[-1] > config.std_floor:
+        lower = round(stds[-1] - config.std_decrement, 4)
         # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
-        if lower == std:
-            return
-        std = config.std_floor if lower <= config.std_floor else lower
-        yield std
+        if lower == stds[-1]:
+            break
+        stds.append(max(lower, config.std_floor))
+    return tuple(stds)
 
 
 def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:

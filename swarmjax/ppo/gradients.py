@@ -1,7 +1,7 @@
 """One gradient step: the PPO loss of a minibatch, and the optimiser's step along its gradient.
 
-A minibatch has B samples, some of which may be invalid. Actions are drawn from a diagonal Gaussian;
-U is the size of an action.
+A minibatch has B samples. Invalid ones are finite and do not count. Actions are drawn from a
+diagonal Gaussian; U is the size of an action.
 """
 
 import math
@@ -11,47 +11,21 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.networks import Acted, Networks, Params
 from swarmjax.shards import ALONE, Shards
 
 Metrics = dict[str, jax.Array]
 Progress = tuple[Params, optax.OptState]
 
+# Weight of the bound term. With 1, robots that block each other did so for ever (docs/results.md,
+# "The mean action was worse because the bound was too weak").
+BOUND_COST = 1500.0
 # Weight of the guess of the state that the critic sees. Whole runs with 0.02 solved more than runs
 # with 0 (docs/worlds-notes.md, "The guess of the state").
 GUESS_COST = 0.02
-
-
-@struct.dataclass(kw_only=True)
-class Minibatch:
-    """The samples of a minibatch. Invalid ones must be finite; they do not count.
-
-    Attributes:
-      observation: [B, O], normalised.
-      action: [B, U], as drawn.
-      log_prob: [B], of the action under the policy that drew it.
-      advantage: [B].
-      return_: [B], target of the critic.
-      valid: [B], bool or 0/1.
-      memory: [B', H], memory before the first step of B' sequences; () each without memory. With
-        memory, samples are ordered by step, [T B'].
-      begins: [B], whether an episode begins with the step; () without memory.
-      state: [B, P], numbers of order 1 that the critic sees in addition; () if there are none.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    log_prob: jax.Array
-    advantage: jax.Array
-    return_: jax.Array
-    valid: jax.Array
-    memory: Recall = NO_MEMORY
-    begins: Any = ()
-    state: Any = ()
 
 
 class Learning(NamedTuple):
@@ -74,14 +48,14 @@ class Learning(NamedTuple):
 
 def ppo_loss(
     params: Params,
-    minibatch: Minibatch,
+    minibatch: Batch,
     networks: Networks,
     config: AlgoConfig,
     expected_valid: jax.Array,
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
-    It is policy + value_cost * value - entropy_cost * entropy + bound_cost * bound. If the critic
+    It is policy + value_cost * value - entropy_cost * entropy + BOUND_COST * bound. If the critic
     sees the state, GUESS_COST * guess is added.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
@@ -104,7 +78,7 @@ def ppo_loss(
 
     Args:
       params: Parameters of the actor and the critic.
-      minibatch: B samples.
+      minibatch: samples, with normalised observations.
       networks: Actor and critic.
       config: Clip range and costs.
       expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
@@ -115,16 +89,15 @@ def ppo_loss(
       `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
       `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
     """
-    chex.assert_rank([minibatch.observation, minibatch.action], 2)
-    chex.assert_rank(
-        [minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid], 1
-    )
+    vectors = (minibatch.observation, minibatch.action)
+    numbers = (minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid)
+    chex.assert_rank([*vectors, *numbers], [2, 2, 1, 1, 1, 1])
     metrics = _terms(*evaluate(params, networks, minibatch), minibatch, config, expected_valid)
     total = (
         metrics["policy_loss"]
         + config.value_cost * metrics["value_loss"]
         - config.entropy_cost * metrics["entropy"]
-        + config.bound_cost * metrics["bound_loss"]
+        + BOUND_COST * metrics["bound_loss"]
     )
     if "guess_loss" in metrics:
         total = total + GUESS_COST * metrics["guess_loss"]
@@ -134,7 +107,7 @@ def ppo_loss(
 def _terms(
     acted: Acted,
     value: jax.Array,
-    minibatch: Minibatch,
+    minibatch: Batch,
     config: AlgoConfig,
     expected_valid: jax.Array,
 ) -> Metrics:
@@ -163,27 +136,17 @@ def _terms(
     return metrics
 
 
-def evaluate(params: Params, networks: Networks, minibatch: Minibatch) -> tuple[Acted, jax.Array]:
-    """Runs actor and critic on samples; with memory, step by step.
-
-    Args:
-      params: Parameters of the actor and the critic.
-      networks: Actor and critic.
-      minibatch: B samples.
-
-    Returns:
-      Output of the actor, without its memory, and value [B].
-    """
+def evaluate(params: Params, networks: Networks, minibatch: Batch) -> tuple[Acted, jax.Array]:
+    """Runs actor and critic on samples, step by step with a memory; returns also the value [B]."""
     seen, state, memory = minibatch.observation, minibatch.state, minibatch.memory
-    if not jax.tree.leaves(memory):
-        acted = networks.act(params, seen, ())
-        return acted, networks.value(params, seen, state, ())[0]
-    begins = minibatch.begins.reshape(-1, memory.actor.shape[0])
-    seen, state = jax.tree.map(lambda x: x.reshape(*begins.shape, -1), (seen, state))
+    begins = minibatch.begins
+    if begins is not None:
+        begins = begins.reshape(-1, memory.actor.shape[0])
+        seen, state = jax.tree.map(lambda x: x.reshape(*begins.shape, -1), (seen, state))
     acted = networks.act(params, seen, memory.actor, begins)
     value, _ = networks.value(params, seen, state, memory.critic, begins)
     mean, guess = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (acted.mean, acted.guess))
-    return acted._replace(mean=mean, memory=(), guess=guess), value.reshape(-1)
+    return acted._replace(mean=mean, guess=guess), value.reshape(-1)
 
 
 def _clipped_surrogate(ratio: jax.Array, advantage: jax.Array, clip: float) -> jax.Array:

@@ -253,7 +253,16 @@ class _Network(nn.Module):
 class _Actor(_Network):
     """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action.
 
-    If the critic sees a state, the actor also guesses it (`guess`).
+    The action is a diagonal Gaussian. Its mean is within -1..1 if the output is tanh, otherwise
+    unbounded. Its deviation does not depend on the observation, and has no gradient if it is
+    scheduled.
+
+    If the critic sees a state, the actor also guesses it (`guess`). The guess is not used for
+    acting. Its error trains the memory to hold what a robot can know about its surroundings
+    (Mirowski et al. 2017, "Learning to Navigate in Complex Environments", section 3).
+
+    Observations are [B, O], or [T, B, O] of sequences. The memory before is [B, H], or () without
+    memory. Of sequences, `begins` [T, B] tells whether an episode begins with the step.
     """
 
     @nn.compact
@@ -277,11 +286,18 @@ class _Actor(_Network):
 
 
 class _Critic(_Network):
-    """Value (`value`) of an observation, and of the state if the critic sees it: [B]."""
+    """Value (`value`) [B] of an observation and of the state [B, P], () if the critic sees none.
+
+    It is the expected discounted return. Memory and `begins` are as for `_Actor`.
+    """
 
     @nn.compact
     def __call__(
-        self, observation: jax.Array, state: Any, memory: Any, begins: jax.Array | None = None
+        self,
+        observation: jax.Array,
+        state: Any = (),
+        memory: Any = (),
+        begins: jax.Array | None = None,
     ) -> tuple[jax.Array, Any]:
         seen = jnp.concatenate([observation, *jax.tree.leaves(state)], axis=-1)
         features, memory = self._features(seen, memory, begins)
@@ -364,51 +380,14 @@ class Networks(NamedTuple):
         zero = jnp.zeros((*shape, config.memory_size), jnp.float32)
         return Recall(zero, zero)
 
-    def act(
-        self, params: Params, observation: jax.Array, memory: Any, begins: jax.Array | None = None
-    ) -> Acted:
-        """Runs the actor.
+    def act(self, params: Params, *seen: Any) -> Acted:
+        """Runs the actor; `seen` as `_Actor` takes it, with normalised observations."""
+        return cast("Acted", self.actor.apply({"params": params["actor"]}, *seen))
 
-        Args:
-          params: result of `init`.
-          observation: [B, O], normalised, or [T, B, O] of sequences.
-          memory: [B, H], memory before; () without memory.
-          begins: [T, B] of sequences, whether an episode begins with the step; None for a single
-            step.
-
-        Returns:
-          The diagonal Gaussian of the action. Its mean is within -1..1 if the output is tanh,
-          otherwise unbounded. Its deviation does not depend on the observation, and has no gradient
-          if it is scheduled. Also the memory after, and a guess of the state that the critic sees.
-          The guess is not used for acting. Its error trains the memory to hold what a robot can
-          know about its surroundings (Mirowski et al. 2017, "Learning to Navigate in Complex
-          Environments", section 3).
-        """
-        output = self.actor.apply({"params": params["actor"]}, observation, memory, begins)
-        return cast("Acted", output)
-
-    def value(
-        self,
-        params: Params,
-        observation: jax.Array,
-        state: Any,
-        memory: Any,
-        begins: jax.Array | None = None,
-    ) -> tuple[jax.Array, Any]:
-        """Runs the critic.
-
-        Args:
-          params: result of `init`.
-          observation: [B, O] or [T, B, O], normalised.
-          state: [B, P] or [T, B, P], numbers of order 1; () if the critic sees no state.
-          memory: [B, H], memory before; () without memory.
-          begins: as in `act`.
-
-        Returns:
-          The expected discounted return, [B] or [T, B], and the memory after.
-        """
-        output = self.critic.apply({"params": params["critic"]}, observation, state, memory, begins)
-        return cast("tuple[jax.Array, Any]", output)
+    def value(self, params: Params, *seen: Any) -> tuple[jax.Array, Any]:
+        """Runs the critic; `seen` as `_Critic` takes it, with normalised observations."""
+        value = self.critic.apply({"params": params["critic"]}, *seen)
+        return cast("tuple[jax.Array, Any]", value)
 
 
 def make(

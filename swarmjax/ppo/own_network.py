@@ -1,6 +1,6 @@
 """An extension's network in place of the hidden layers: its checks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,10 +12,8 @@ from swarmjax.extension import Network
 from swarmjax.ppo.config import AlgoConfig, resolve
 
 
-def load(
-    config: AlgoConfig, networks: Sequence[Network], observation: int, state: int
-) -> Callable[[], Any] | None:
-    """Returns what makes the network that a config means; None for hidden layers.
+def load(config: AlgoConfig, networks: Sequence[Network], observation: int, state: int) -> Any:
+    """Returns the class of the network that a config means; None for hidden layers.
 
     Args:
       config: as for `resolve`.
@@ -28,14 +26,12 @@ def load(
     """
     name = resolve(config, networks)
     torso = {piece.name: piece.function for piece in networks}.get(name)
-    if torso is not None:
-        _check_torso(torso, name, observation)
-        if state:
-            _check_torso(torso, f"{name} for a critic of the state", observation + state)
+    for size in {observation, observation + state} if torso else ():
+        _check(torso, name, size)
     return torso
 
 
-def _check_torso(torso: Any, name: str, observation_size: int) -> None:
+def _check(torso: Any, name: str, observation_size: int) -> None:
     """Refuses a network that fails, or does not turn [B, O] into [B, F]."""
     seen = jax.ShapeDtypeStruct((3, observation_size), jnp.float32)
     where = f"network {name}"

@@ -24,12 +24,10 @@ from swarmjax.ppo import dispatch, exploration, gradients, networks, optimizer
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
-from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
+from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.networks import Normalizer, Params, Sizes
 from swarmjax.shards import ALONE, Shards
-
-_ADVANTAGE_EPSILON = 1e-8
 
 
 @struct.dataclass(kw_only=True)
@@ -210,10 +208,10 @@ class PPO:
         ), metrics
 
     def explore(self, learner: LearnerState, steps: jax.Array | int) -> LearnerState:
-        """Moves a learner along the schedule of exploration, if there is one.
+        """Moves learners along the schedule of exploration, if there is one.
 
         Args:
-          learner: the learner before these steps.
+          learner: the learner before these steps, with any leading axes.
           steps: [], how many control steps of all arenas follow, at least 1.
 
         Returns:
@@ -225,12 +223,37 @@ class PPO:
         # The count stays at its largest value, since a run may go on from another one's count.
         explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
         std = exploration.scheduled_std(self.config, explored - 1)
-        return replace(_with_log_std(learner, jnp.log(std)), explored=explored)
+        return replace(_with_log_std(learner, jnp.log(std)[..., None]), explored=explored)
 
-    def explore_anew(self, learner: LearnerState) -> LearnerState:
-        """Resets the exploration of a learner, with any leading axes, to that of a new learner."""
-        begun = _with_log_std(learner, math.log(self.config.initial_std))
-        return replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
+    def begin_again(
+        self, learner: LearnerState, *, optimizer: bool, exploration: bool
+    ) -> LearnerState:
+        """Resets parts of a learner, with any leading axes, to those of a new learner.
+
+        Args:
+          learner: the learner.
+          optimizer: Whether to reset Adam's moments, and the count that corrects their bias. The
+            learning rate's schedule has its own count and goes on.
+          exploration: Whether to reset the deviation and its schedule.
+
+        Returns:
+          The learner; itself if nothing is reset.
+        """
+        if optimizer:
+            state = jax.tree.map(_without_moments, learner.optimizer_state, is_leaf=_is_adam)
+            learner = replace(learner, optimizer_state=state)
+        if exploration:
+            begun = _with_log_std(learner, math.log(self.config.initial_std))
+            learner = replace(begun, explored=jax.tree.map(jnp.zeros_like, learner.explored))
+        return learner
+
+
+def _is_adam(part: object) -> bool:
+    return isinstance(part, optax.ScaleByAdamState)
+
+
+def _without_moments(part: Any) -> Any:
+    return jax.tree.map(jnp.zeros_like, part) if _is_adam(part) else part
 
 
 def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerState:
@@ -253,11 +276,12 @@ def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
 
 def _is_finite(batch: Batch) -> jax.Array:
     """Tells which samples, [G, N], hold only finite numbers."""
-    numbers = (batch.log_prob, batch.advantage, batch.return_)
-    vectors = jax.tree.leaves((batch.observation, batch.action, batch.state))
-    finite = [jnp.isfinite(x) for x in numbers]
-    finite += [jnp.all(jnp.isfinite(x), axis=-1) for x in vectors]
-    return functools.reduce(jnp.logical_and, finite)
+    numbers = (batch.observation, batch.action, batch.log_prob)
+    numbers += (batch.advantage, batch.return_, batch.state)
+    each = jax.tree.map(
+        lambda x: jnp.all(jnp.isfinite(x).reshape(*batch.valid.shape, -1), axis=-1), numbers
+    )
+    return functools.reduce(jnp.logical_and, jax.tree.leaves(each))
 
 
 def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
@@ -268,38 +292,23 @@ def _check(config: AlgoConfig, batch: Batch, shards: Shards) -> None:
     chex.assert_is_divisible(batch.valid.shape[0], config.num_minibatches * shards.local_streams)
 
 
-def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Minibatch:
+def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Shards) -> Batch:
     """Prepares samples for the loss, still [G, N, ...]: normalised, and zero where not valid."""
     valid, advantage = batch.valid.astype(bool), batch.advantage
     if config.advantage == "gae":
-        advantage = _normalize_advantages(advantage, valid, shards)
-    samples = Minibatch(
-        observation=learner.normalizer.normalize(batch.observation),
-        action=batch.action,
-        log_prob=batch.log_prob,
-        advantage=advantage,
-        return_=batch.return_,
-        valid=valid,
-        state=batch.state,
-    )
+        advantage = batches.normalize(advantage, valid, shards, ddof=0, epsilon=1e-8)
+    observation = learner.normalizer.normalize(batch.observation)
+    samples = replace(batch, observation=observation, advantage=advantage, memory=NO_MEMORY)
     # Otherwise a NaN in an invalid sample would spread through the networks into every gradient.
     masked = jax.tree.map(
         lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 2)), x, 0), samples
     )
     memory = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 0.0), batch.memory)
-    return replace(masked, memory=memory, begins=batch.begins)
-
-
-def _normalize_advantages(advantage: jax.Array, valid: jax.Array, shards: Shards) -> jax.Array:
-    """Scales advantages to mean 0 and standard deviation 1 over the valid samples, [G, N]."""
-    count = jnp.maximum(shards.sum(jnp.sum(valid)), 1)
-    mean = shards.sum(jnp.sum(jnp.where(valid, advantage, 0.0))) / count
-    variance = shards.sum(jnp.sum(jnp.where(valid, (advantage - mean) ** 2, 0.0))) / count
-    return (advantage - mean) / (jnp.sqrt(variance) + _ADVANTAGE_EPSILON)
+    return replace(masked, valid=valid, memory=memory, begins=batch.begins)
 
 
 def _learn(
-    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
+    learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Takes all gradient steps, epoch after epoch; returns the metrics of each step."""
     config, shards = learning.config, learning.shards
@@ -318,7 +327,7 @@ def _learn(
     return jax.lax.scan(step, begun, order.reshape(-1, order.shape[-1]))
 
 
-def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatch:
+def _gather(samples: Batch, rows: jax.Array, config: AlgoConfig) -> Batch:
     """Takes whole groups [G, N, ...] as samples [B, ...], ordered by step if there is a memory."""
     if not jax.tree.leaves(samples.memory):
         return jax.tree.map(lambda x: x[rows].reshape(-1, *x.shape[2:]), samples)
@@ -328,8 +337,7 @@ def _gather(samples: Minibatch, rows: jax.Array, config: AlgoConfig) -> Minibatc
         return jnp.moveaxis(sequences, 1, 0).reshape(-1, *x.shape[2:])
 
     memory = jax.tree.map(lambda x: x[rows].reshape(-1, x.shape[-1]), samples.memory)
-    flat = jax.tree.map(by_step, replace(samples, memory=NO_MEMORY))
-    return replace(flat, memory=memory)
+    return replace(jax.tree.map(by_step, replace(samples, memory=NO_MEMORY)), memory=memory)
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:

@@ -136,11 +136,6 @@ class TrainConfig(ProgramConfig):
     def _check_hearing(self) -> None:
         """Refuses options that a network that observes neighbours does not support."""
         count = self.task.neighbours.count
-        if count and self.algo.update_backend == "fused":
-            raise ConfigError(
-                f"algo.update_backend is fused, but task.neighbours.count is {count}: give auto or "
-                "autodiff, or task.neighbours.count=0."
-            )
         if count and self.algo.network not in (None, "mlp"):
             raise ConfigError(
                 f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "

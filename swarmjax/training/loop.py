@@ -4,13 +4,11 @@ The number of updates is an argument, so one program serves every chunk size. An
 the same run.
 """
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array
 
@@ -65,13 +63,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     curriculum = curricula.init(program.curriculum(schedule), schedule)
     starts = _draw(program, schedule, curriculum, level_key, waiting=1)
     learners = jax.vmap(program.ppo.init)(jax.random.split(learner_key, config.learners))
-    return TrainState(
-        learners=learners,
-        arenas=starts,
-        curriculum=curriculum,
-        key=run_key,
-        update=jnp.zeros((), jnp.int32),
-    )
+    return TrainState(learners, starts, curriculum, run_key, jnp.zeros((), jnp.int32))
 
 
 def train_chunk(
@@ -112,53 +104,42 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     Returns:
       The state after, and the metrics of this update.
     """
-    config, shards = program.config, program.shards
+    config, shards, before = program.config, program.shards, state.curriculum
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
-    waiting = _draw(program, schedule, state.curriculum, level_key, waiting=program.waiting)
+    waiting = _draw(program, schedule, before, level_key, waiting=program.waiting)
     arenas, trajectory, ended = rollout.collect(
         program, state.learners, state.arenas, waiting, rollout_key
     )
     batch = rollout.batch(program, trajectory, state.arenas.recall, ended)
-    explored = rollout.explore(program, state.learners, config.algo.rollout_length)
+    steps = config.arenas * config.algo.rollout_length
+    explored = program.ppo.explore(state.learners, steps)
     learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
+    loss = batches.value_loss(batch, ended.episodes > 0)
+    success = config.curriculum.success
     curriculum = curricula.observe(
-        program.curriculum(schedule),
-        schedule,
-        config.curriculum.success,
-        state.curriculum,
-        ended,
-        batches.value_loss(batch, ended.episodes > 0),
-        state.update,
-        shards,
+        program.curriculum(schedule), schedule, success, before, ended, loss, state.update, shards
     )
-    learners = carry_over(learners, program, state.curriculum, curriculum)
-    before = state.curriculum.chosen
+    learners = carry_over(learners, program, before, curriculum)
+    stage, every_stage = before.chosen.stage, jnp.arange(len(schedule.deadline))[:, None]
     metrics = {
         "update": state.update,
-        "stage": before.stage,
-        **_curriculum_metrics(config, state.curriculum, curriculum),
+        "stage": stage,
+        **_curriculum_metrics(config, before, curriculum),
         **_learner_metrics(learned, batch, shards),
         **shards.sum(
             {
-                "mix": _mix(arenas.stage, before.weights.shape[0]),
+                "mix": jnp.sum(arenas.stage == every_stage, axis=-1, dtype=jnp.int32),
                 "robots": jnp.sum(arenas.level.present),
                 "transitions": jnp.sum(trajectory.valid),
-                **_episode_metrics(ended, before.stage),
+                **_episode_metrics(ended, stage),
             }
         ),
     }
     if program.by_robot:
         every = jax.tree.map(partial(shards.gather, axis=1), ended)
         metrics[episodes.KEY] = episodes.pack(every, episodes.room(config))
-    new = TrainState(
-        learners=learners,
-        arenas=arenas,
-        curriculum=curriculum,
-        key=key,
-        update=state.update + 1,
-    )
-    return new, metrics
+    return TrainState(learners, arenas, curriculum, key, state.update + 1), metrics
 
 
 def carry_over(
@@ -181,40 +162,22 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    if len(learners.normalizer.count) > 1:
-        carried = _copied(carried, before.met, after.met)
-    if options.optimizer == "reset":
-        carried = replace(carried, optimizer_state=_forgotten(carried.optimizer_state))
-    if options.exploration == "reset":
-        carried = program.ppo.explore_anew(carried)
+    count = len(learners.normalizer.count)
+    if count > 1:  # learner i % before.met is copied to the place of learner i
+        index = jnp.arange(count)
+        new = (index >= before.met) & (index < after.met)
+        source = jnp.where(new, index % before.met, index)
+        carried = jax.tree.map(lambda x: x[source], learners)
+    carried = program.ppo.begin_again(
+        carried,
+        optimizer=options.optimizer == "reset",
+        exploration=options.exploration == "reset",
+    )
     if carried is learners:
         return learners
     reason = after.chosen.reason
     promoted = (reason == BY_THRESHOLD) | (reason == BY_BUDGET)
     return jax.tree.map(lambda new, old: jnp.where(promoted, new, old), carried, learners)
-
-
-def _copied(learners: LearnerState, before: Array, after: Array) -> LearnerState:
-    """Copies learner i % before to the place of learner i, for before <= i < after."""
-    index = jnp.arange(learners.normalizer.count.shape[0])
-    new = (index >= before) & (index < after)
-    source = jnp.where(new, index % before, index)
-    return jax.tree.map(lambda x: x[source], learners)
-
-
-def _forgotten(state: optax.OptState) -> optax.OptState:
-    """Sets Adam's moments, and the count that corrects their bias, to 0.
-
-    The learning rate's schedule has its own count and goes on.
-    """
-
-    def is_adam(part: object) -> bool:
-        return isinstance(part, optax.ScaleByAdamState)
-
-    def forget(part: optax.OptState) -> optax.OptState:
-        return jax.tree.map(jnp.zeros_like, part) if is_adam(part) else part
-
-    return jax.tree.map(forget, state, is_leaf=is_adam)
 
 
 def _draw(
@@ -231,11 +194,6 @@ def _draw(
     return rollout.draw_starts(
         program.world, schedule.stages, following, cohort, key, shards, memory
     )
-
-
-def _mix(stage: Array, stages: int) -> Array:
-    """Counts the arenas on each stage, from the stage of each arena [A]."""
-    return jnp.sum(stage == jnp.arange(stages)[:, None], axis=-1, dtype=jnp.int32)
 
 
 def _curriculum_metrics(

@@ -6,7 +6,6 @@ there is no mesh, and the program is that of `seeds`.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -135,7 +134,7 @@ def put(program: Program, state: TrainState) -> TrainState:
 
     Args:
       program: the compiled program.
-      state: [N] states with all arenas, or without arenas (None).
+      state: [N] states with all arenas.
 
     Returns:
       The same state.
@@ -143,8 +142,6 @@ def put(program: Program, state: TrainState) -> TrainState:
     if program.config.devices == 1:
         return state
     shardings = _layout(program.config).shardings
-    if state.arenas is None:
-        shardings = replace(shardings, arenas=None)
     return jax.tree.map(
         lambda sharding, part: jax.tree.map(partial(_placed, sharding), part), shardings, state
     )

@@ -29,11 +29,6 @@ _DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
 MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
 
 
-def shards_of(config: ProgramConfig) -> Shards:
-    """Returns how the arenas of a seed are spread over devices."""
-    return Shards(config.arena_devices, config.stream_count)
-
-
 def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) -> Program[C]:
     """Builds the program of an environment that is there already; otherwise as `load`."""
     rows = max(1, MAX_ROWS // config.seeds)
@@ -85,7 +80,7 @@ def load_ppo(config: ProgramConfig, world: World) -> PPO:
         sizes,
         config.updates,
         pieces=extension.load(config.extensions).networks,
-        shards=shards_of(config),
+        shards=Shards(config.arena_devices, config.stream_count),
         side_by_side=side_by_side(config) * config.learners,
     )
 

@@ -173,7 +173,7 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    waits = _Waiting(starts, _judge(program, learners, starts))
+    waits = starts, _judge(program, learners, starts)
     step = functools.partial(_step, program, learners, waits)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
@@ -204,12 +204,6 @@ def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended
     return each(trajectory, first, ended.episodes > 0)
 
 
-def explore(program: Program, learners: LearnerState, steps: Array | int) -> LearnerState:
-    """Moves the learners [L] along the schedule of exploration, by `steps` of every arena."""
-    arenas = program.config.arenas
-    return jax.vmap(lambda learner: program.ppo.explore(learner, steps * arenas))(learners)
-
-
 class _Judged(NamedTuple):
     """The critics' results for the current observations, [L, A, N, ...].
 
@@ -224,19 +218,14 @@ class _Judged(NamedTuple):
     state: Any
 
 
-class _Waiting(NamedTuple):
-    """Waiting episodes [W A], packed, and the critics' results for their first observations."""
-
-    starts: Arena
-    judged: _Judged
-
-
 # The counts of `Ended` that are one number each.
 _COUNTS = (
     *("episodes", "stage", "cohort", "targets", "reached", "all_reached"),
     *("steps", "robot_steps", "sensed", "broken"),
 )
 
+# Waiting episodes [W A], packed, and the critics' results for their first observations.
+_Waiting = tuple[Arena, _Judged]
 _Counts = tuple[Array, Ended]  # counts [A, K]; the other results [A]
 _Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
 
@@ -253,7 +242,7 @@ def _step(
     count = judged.value.shape[0]
     mine = to_learners(arenas.observation, count)
     noise = _noise(program.shards, key, (*mine.shape[:-1], drive.ACTION_SIZE))
-    acting = explore(program, learners, number)
+    acting = program.ppo.explore(learners, number * program.config.arenas)
     memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.actor)
     action, log_prob, memory = jax.vmap(program.ppo.act)(acting, mine, noise, memory)
     arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
@@ -289,9 +278,8 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
 
 def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
     """Picks the next episode [A] of each arena, and the critics' results for it."""
-    arenas = begun.shape[0]
-    count = waits.starts.cohort.shape[0] // arenas
-    starts, judged = waits
+    (starts, judged), arenas = waits, begun.shape[0]
+    count = starts.cohort.shape[0] // arenas
     if count > 1:
         index = jnp.minimum(begun, count - 1) * arenas + jnp.arange(arenas)
         starts = jax.tree.map(lambda x: x[index], starts)

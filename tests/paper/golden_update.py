@@ -125,7 +125,6 @@ def _learn(
 def _loss(metrics: dict[str, jax.Array], config: AlgoConfig) -> float:
     """Returns the total loss from the metrics, which are means over the epochs."""
     parts = metrics["policy_loss"] + config.value_cost * metrics["value_loss"]
-    parts += config.bound_cost * metrics["bound_loss"]  # 0: tanh stays within the bounds
     return float((parts - config.entropy_cost * metrics["entropy"])[0])
 
 
@@ -143,7 +142,7 @@ def errors(case: str, idle: int = 0, trained: tuple[int, ...] = (1, 80)) -> dict
     path = trajectory(state, config, idle)
     batch = jax.jit(made.batch)(path, NO_MEMORY, jnp.zeros(path.valid.shape[:2], bool))
     batch = jax.tree.map(lambda x: x[None], batch)
-    state = jax.vmap(lambda one: made.explore(one, steps))(state)
+    state = made.explore(state, steps)
     found = {}
     if "returns" in golden:
         valid = np.asarray(batch.valid[0, 0])

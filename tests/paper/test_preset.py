@@ -118,8 +118,8 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
         (["algo=paper", "algo.std_floor=0.7"],
          "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
         (["algo.mean_activation=tanh", "algo.activation=relu"],
-         "algo.mean_activation is tanh, but activation is relu, and a policy file stores one "
-         "activation for all layers: give activation=tanh or mean_activation=linear."),
+         "algo.mean_activation is tanh, but activation is relu and memory is none: give "
+         "activation=tanh and memory=none, or mean_activation=linear."),
         (["algo=paper", "budget=5999"],
          "budget is 5999, but one update takes arenas x algo.rollout_length = 6000 control steps: "
          "give at least 6000."),

@@ -97,7 +97,7 @@ def _round(
     arenas, path, ended = rollout.collect(
         program, state.learners, state.arenas, starts, rollout_key
     )
-    learners = rollout.explore(program, state.learners, config.algo.rollout_length)
+    learners = program.ppo.explore(state.learners, config.algo.rollout_length)
     still = jnp.zeros_like(path.action)
     mean = jax.vmap(program.ppo.act, in_axes=(0, 1, 1))(learners, path.observation, still)[0]
     found = {

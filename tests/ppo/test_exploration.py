@@ -55,7 +55,7 @@ def test_a_learner_explores_with_the_level_of_its_last_step() -> None:
         assert state.explored == explored
         # float32 rounding of a logarithm and an exponential.
         np.testing.assert_allclose(_std(state), [std, std], rtol=1e-6)
-    begun = PPO_.explore_anew(state)
+    begun = PPO_.begin_again(state, optimizer=False, exploration=True)
     assert begun.explored == 0
     np.testing.assert_allclose(_std(begun), [0.6, 0.6], rtol=1e-6)
 

@@ -120,7 +120,7 @@ def test_what_is_heard_is_not_normalised_by_what_was_heard_before() -> None:
 
 
 def test_the_kernels_are_not_taken_for_robots_that_hear(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "_has_tensor_cores", lambda: True)
+    monkeypatch.setattr(dispatch, "_runs_kernels", lambda: True)
     plain = Sizes(10 + COUNT * WIDTH, 2)
     heard = plain._replace(hearing=Hearing(10, COUNT, WIDTH))
     for sizes, backend in ((plain, "fused"), (heard, "autodiff")):

@@ -167,7 +167,7 @@ def test_metrics_of_a_single_step_equal_the_loss_over_the_whole_batch() -> None:
     valid = np.asarray(batch.valid)
     advantage = np.asarray(batch.advantage)
     inside = advantage[valid]
-    minibatch = gradients.Minibatch(
+    minibatch = Batch(
         observation=state.normalizer.normalize(batch.observation)[valid],
         action=batch.action[valid],
         log_prob=batch.log_prob[valid],

@@ -11,26 +11,31 @@ import scipy.stats
 from flax import traverse_util
 
 from swarmjax.ppo import gradients
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.gradients import Minibatch, ppo_loss
+from swarmjax.ppo.gradients import ppo_loss
 
 B, OBSERVATION, U = 24, 3, 2
-CONFIG = AlgoConfig(
-    hidden_sizes=(8,), clip_epsilon=0.2, value_cost=0.7, entropy_cost=0.03, bound_cost=0.4
-)
+CONFIG = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, value_cost=0.7, entropy_cost=0.03)
 NETS = learners.nets(CONFIG, OBSERVATION, U)
 PARAMS = jax.jit(NETS.init)(jax.random.key(0))
 PARAMS["actor"]["mean"]["kernel"] *= 150.0  # so that means lie on both sides of -1 and of 1
 _loss = jax.jit(ppo_loss, static_argnums=(2, 3))
 
 
-def _minibatch(valid_share: float = 0.6) -> Minibatch:
+@pytest.fixture(autouse=True)
+def _bound_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keeps the bound term from hiding the other terms."""
+    monkeypatch.setattr(gradients, "BOUND_COST", 0.4)
+
+
+def _minibatch(valid_share: float = 0.6) -> Batch:
     random = np.random.default_rng(0)
     observation = random.normal(size=(B, OBSERVATION)).astype(np.float32)
     action = random.normal(size=(B, U)).astype(np.float32)
     mean, std, *_ = NETS.act(PARAMS, observation, ())
     log_prob = np.asarray(gradients.log_density(mean, std, action))
-    return Minibatch(
+    return Batch(
         observation=observation,
         action=action,
         # Ratios range from e**-0.9 to e**0.9, so many lie below 0.8 and many above 1.2.
@@ -41,7 +46,7 @@ def _minibatch(valid_share: float = 0.6) -> Minibatch:
     )
 
 
-def _expected(minibatch: Minibatch, expected_valid: float) -> dict[str, float]:
+def _expected(minibatch: Batch, expected_valid: float) -> dict[str, float]:
     mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
     value = np.asarray(NETS.value(PARAMS, minibatch.observation, (), ())[0], np.float64)
     log_prob = scipy.stats.norm.logpdf(minibatch.action, mean, std).sum(axis=-1)
@@ -78,11 +83,14 @@ def test_loss_and_its_parts_equal_numpy(expected_valid: float) -> None:
         np.testing.assert_allclose(metrics[name], part, rtol=1e-5, atol=1e-5, err_msg=name)
 
 
-def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has() -> None:
+def test_a_clipped_ratio_has_no_gradient_and_an_unclipped_one_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     minibatch = _minibatch()
     mean, std, *_ = NETS.act(PARAMS, minibatch.observation, ())
     log_prob = gradients.log_density(mean, std, minibatch.action)
-    config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0, bound_cost=0.0)
+    config = AlgoConfig(hidden_sizes=(8,), clip_epsilon=0.2, entropy_cost=0.0)
+    monkeypatch.setattr(gradients, "BOUND_COST", 0.0)
     loss = jax.jit(jax.grad(ppo_loss, has_aux=True), static_argnums=(2, 3))
 
     def slope(ratio: float, advantage: float) -> float:

@@ -15,7 +15,6 @@ from swarmjax.config import ConfigError
 from swarmjax.ppo import gradients
 from swarmjax.ppo.batch import Batch, generalized_advantages
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.gradients import Minibatch
 from swarmjax.ppo.memory import NO_MEMORY, Gru, Recall
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO
@@ -94,12 +93,12 @@ CONFIG = AlgoConfig(
 )
 
 
-def _minibatch() -> Minibatch:
+def _minibatch() -> Batch:
     sequences, length = 3, CONFIG.rollout_length
     count = sequences * length
     begins = np.zeros((length, sequences), bool)
     begins[5, 1] = True
-    return Minibatch(
+    return Batch(
         observation=jnp.array(_drawn(count, WIDTH)),
         action=jnp.array(_drawn(count, 2, seed=1)),
         log_prob=jnp.full(count, -2.5),
@@ -209,7 +208,6 @@ def test_a_task_that_asks_for_what_was_seen_twenty_steps_ago(
         actor_learning_rate=5e-3,
         critic_learning_rate=5e-3,
         learning_rate_schedule="constant",
-        bound_cost=0.0,
     )
     ppo = learners.ppo(config, Sizes(2 * history, 1), _UPDATES, "autodiff")
     state = jax.jit(ppo.init)(jax.random.key(3))
@@ -261,9 +259,7 @@ def test_a_memory_that_is_no_number_spoils_nothing() -> None:
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"rollout_length": 4}, "rollout_length is 4, but memory is gru"),
-        ({"update_backend": "fused"}, "update_backend is fused, but memory is gru"),
-        ({"mean_activation": "tanh"}, "mean_activation is tanh, but memory is gru"),
+        ({"mean_activation": "tanh"}, "mean_activation is tanh, but .* memory is gru"),
         ({"network": "mine"}, "network is 'mine', but memory is gru"),
         ({"memory": "none", "memory_size": 8}, "memory_size is 8, but memory is none"),
     ],

@@ -4,14 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.ppo.batch import monte_carlo_returns, normalize_returns
+from swarmjax.ppo.batch import normalize, sum_back
 
 REWARD = np.array([1.0, 2.0, 4.0, 8.0, 16.0], np.float32)
 
 
 def _returns(ends: list[int]) -> list[float]:
     boundary = np.isin(np.arange(5), ends)
-    return monte_carlo_returns(jnp.asarray(REWARD), jnp.asarray(boundary), discount=0.5).tolist()
+    return sum_back(jnp.asarray(REWARD), jnp.asarray(boundary), 0.5).tolist()
 
 
 def test_returns_by_hand() -> None:
@@ -27,7 +27,7 @@ def test_nothing_passes_a_boundary_not_even_nan() -> None:
     spoilt = REWARD.copy()
     spoilt[2:] = np.nan
     boundary = np.array([False, True, False, False, False])
-    found = monte_carlo_returns(jnp.asarray(spoilt), jnp.asarray(boundary), discount=0.5)
+    found = sum_back(jnp.asarray(spoilt), jnp.asarray(boundary), 0.5)
     assert found[:2].tolist() == [2.0, 2.0]
 
 
@@ -35,9 +35,14 @@ def test_arenas_keep_apart() -> None:
     reward = np.stack([REWARD, 3 * REWARD], axis=-1)
     boundary = np.zeros((5, 2), bool)
     boundary[1, 1] = True
-    found = monte_carlo_returns(jnp.asarray(reward), jnp.asarray(boundary), discount=0.5)
+    found = sum_back(jnp.asarray(reward), jnp.asarray(boundary), 0.5)
     assert found[:, 0].tolist() == _returns([])
     assert found[:, 1].tolist() == [3 * x for x in _returns([1])]
+
+
+def _normalize(returns: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    values = jnp.asarray(returns, jnp.float32)
+    return np.asarray(normalize(values, jnp.asarray(valid), ddof=1, epsilon=1e-7))
 
 
 def test_returns_are_normalised_over_the_valid_samples() -> None:
@@ -45,7 +50,7 @@ def test_returns_are_normalised_over_the_valid_samples() -> None:
     returns = random.normal(3.0, 2.0, (50, 4))
     valid = random.random((50, 4)) < 0.6
     returns[~valid] = 1e6
-    found = np.asarray(normalize_returns(jnp.asarray(returns, jnp.float32), jnp.asarray(valid)))
+    found = _normalize(returns, valid)
     inside = returns[valid]
     expected = (inside - inside.mean()) / (inside.std(ddof=1) + 1e-7)
     # float32 rounding of values around 3, with a deviation of 2.
@@ -55,6 +60,6 @@ def test_returns_are_normalised_over_the_valid_samples() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_samples_give_no_nan(count: int) -> None:
     valid = np.arange(3) < count
-    found = normalize_returns(jnp.asarray(REWARD[:3]), jnp.asarray(valid))
+    found = _normalize(REWARD[:3], valid)
     assert np.isfinite(found).all()
     assert not found[:count].any()

@@ -18,7 +18,6 @@ import pytest
 from swarmjax.ppo.batch import Batch, generalized_advantages
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.dispatch import Backend
-from swarmjax.ppo.fast import fused
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 
@@ -199,8 +198,7 @@ def test_an_actor_beyond_the_range_of_commands_comes_back() -> None:
 
 @pytest.mark.slow
 def test_the_kernels_teach_the_actor_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    interpreted = functools.partial(fused.flat_gradient, interpret=True)
-    monkeypatch.setattr(fused, "flat_gradient", interpreted)
+    learners.interpret_kernels(monkeypatch)
     probe = Probe(
         1, lambda draw, clock: draw, lambda draw, action, clock: -((action - 0.5 * draw) ** 2)
     )

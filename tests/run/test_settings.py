@@ -236,8 +236,6 @@ def test_import_needs_neither_jax_nor_hydra():
          "give single stages."),
         # Checks across keys.
         (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
-        (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
-         "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
         (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
          "task.neighbours.count is 2, which works only with hidden layers: give algo.network=mlp "
          "or task.neighbours.count=0."),

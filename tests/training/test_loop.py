@@ -106,7 +106,6 @@ def test_levels_noise_and_shuffles_are_drawn_by_keys_of_their_own(
     monkeypatch.setattr(loop, "_draw", take)
     monkeypatch.setattr(rollout, "collect", take)
     monkeypatch.setattr(rollout, "batch", lambda *_: None)
-    monkeypatch.setattr(rollout, "explore", lambda *_: None)
     monkeypatch.setattr(jax.random, "split", split_once)
     with pytest.raises(StopIteration):
         loop.update(program, programs.schedule(program.config), state)

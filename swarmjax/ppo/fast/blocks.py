@@ -8,13 +8,13 @@ with the most samples.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from swarmjax.ppo import gradients
-from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
+from swarmjax.ppo.batch import Batch
+from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Params
 
 # Samples of a block. With layers of 64, sizes from 100 to 6,000 were tried: 250 to 400 samples took
@@ -22,20 +22,8 @@ from swarmjax.ppo.networks import Params
 BLOCK = 256
 
 
-class Blocks(NamedTuple):
-    """The samples of a batch, the valid ones first.
-
-    Attributes:
-      samples: [K, B, ...], B at most `BLOCK`.
-      used: [], int32, how many blocks hold a valid sample. They come first.
-    """
-
-    samples: Minibatch
-    used: jax.Array
-
-
 def learn(
-    learning: Learning, begun: Progress, samples: Minibatch, _: jax.Array
+    learning: Learning, begun: Progress, samples: Batch, _: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch: each epoch is one step on all samples, so their order does not matter.
 
@@ -49,11 +37,12 @@ def learn(
     """
 
     @jax.custom_batching.sequential_vmap
-    def one_learner(begun: Progress, samples: Minibatch) -> tuple[Progress, Metrics]:
-        blocks, count = arrange(samples), learning.shards.sum(jnp.sum(samples.valid))
+    def one_learner(begun: Progress, samples: Batch) -> tuple[Progress, Metrics]:
+        blocks, used = arrange(samples)
+        count = learning.shards.sum(jnp.sum(samples.valid))
 
         def epoch(progress: Progress, _: None) -> tuple[Progress, Metrics]:
-            found = gradient(progress[0], blocks, learning, count)
+            found = gradient(progress[0], blocks, used, learning, count)
             return gradients.take(learning, progress, found, count > 0)
 
         return jax.lax.scan(epoch, begun, length=learning.config.epochs)
@@ -61,14 +50,15 @@ def learn(
     return one_learner(begun, samples)
 
 
-def arrange(samples: Minibatch) -> Blocks:
+def arrange(samples: Batch) -> tuple[Batch, jax.Array]:
     """Puts the valid samples first and cuts all of them into blocks.
 
     Args:
       samples: [G, N, ...], zero where not valid.
 
     Returns:
-      The blocks; the padding of the last one is not valid.
+      The blocks [K, B, ...], B at most `BLOCK`; the padding of the last one is not valid. Also how
+      many blocks hold a valid sample, [], int32; they come first.
     """
     flat = valid_first(samples)
     size = min(BLOCK, len(flat.valid))
@@ -79,17 +69,18 @@ def arrange(samples: Minibatch) -> Blocks:
         return padded.reshape(-1, size, *x.shape[1:])
 
     valid = jnp.sum(flat.valid, dtype=jnp.int32)
-    return Blocks(jax.tree.map(cut, flat), (valid + size - 1) // size)
+    return jax.tree.map(cut, flat), (valid + size - 1) // size
 
 
 def gradient(
-    params: Params, blocks: Blocks, learning: Learning, expected_valid: jax.Array
+    params: Params, blocks: Batch, used: jax.Array, learning: Learning, expected_valid: jax.Array
 ) -> tuple[Params, Metrics]:
     """Computes the gradient of `gradients.ppo_loss` over all samples.
 
     Args:
       params: Parameters of the actor and the critic.
-      blocks: The samples.
+      blocks: The samples, [K, B, ...].
+      used: [], how many blocks to use.
       learning: Networks, clip range and costs.
       expected_valid: [], valid samples of the batch.
 
@@ -98,12 +89,12 @@ def gradient(
     """
 
     def of_block(i: jax.Array | int) -> tuple[Params, Metrics]:
-        block = jax.tree.map(lambda x: x[i], blocks.samples)
+        block = jax.tree.map(lambda x: x[i], blocks)
         return jax.grad(gradients.ppo_loss, has_aux=True)(
             params, block, learning.networks, learning.config, expected_valid
         )
 
-    return add_up(blocks.used, of_block)
+    return add_up(used, of_block)
 
 
 def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
@@ -125,7 +116,7 @@ def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
     return jax.lax.fori_loop(0, count, add, nothing)
 
 
-def valid_first(samples: Minibatch) -> Minibatch:
+def valid_first(samples: Batch) -> Batch:
     """Lays all samples out along one axis, the valid ones first and in their given order.
 
     Args:

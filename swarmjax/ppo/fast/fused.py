@@ -5,7 +5,7 @@ max(expected_valid, 1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the
 is
 
     1/n sum_s [-min(r_s A_s, clip(r_s) A_s) + value_cost (V_s - R_s)^2 / 2 - entropy_cost H
-               + bound_cost |b_s|^2].
+               + BOUND_COST |b_s|^2].
 
 b_s is how far the mean action lies beyond -1..1.
 
@@ -20,18 +20,18 @@ import itertools
 import math
 from dataclasses import replace
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
 from swarmjax.ppo import gradients
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import kernel
 from swarmjax.ppo.fast.blocks import valid_first
-from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Place, Samples, Tiles
-from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
+from swarmjax.ppo.fast.kernel import KernelLayout, Launch, Loss, Place, Samples, Tiles
+from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Params
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
@@ -58,7 +58,11 @@ METRICS = (
     "skipped_steps",
 )
 
-_Run = functools.partial[tuple[jax.Array, Metrics]]
+# What the kernel of each network reads of a sample.
+_READ = {
+    "actor": ("observation", "action", "log_prob", "advantage", "valid"),
+    "critic": ("observation", "return_", "valid"),
+}
 Flat = dict[str, jax.Array]  # a vector for each network, in the order of its tree's leaves
 
 
@@ -174,13 +178,12 @@ def shuffle(
 def flat_gradient(
     flat: Flat,
     layout: dict[str, KernelLayout],
-    samples: Minibatch,
+    samples: Batch,
     tiles: Tiles,
     config: AlgoConfig,
     expected_valid: jax.Array,
     *,
     launch: Launch,
-    interpret: bool = False,
 ) -> tuple[Flat, Metrics, jax.Array]:
     """Computes the gradient over some tiles of a batch, with each network as one vector.
 
@@ -194,26 +197,20 @@ def flat_gradient(
       config: Clip range and costs.
       expected_valid: [], as `gradients.ppo_loss` takes it.
       launch: How the kernels are spread over the GPU.
-      interpret: Whether to run them as ordinary JAX, on any device.
 
     Returns:
       The gradient, in the shape of `flat`; `METRICS`, each []; and the number of valid samples in
       the tiles, [].
-
-    Raises:
-      ValueError: `fits` refuses the layers.
     """
-    _check(samples, layout, config)
     share = 1.0 / jnp.maximum(expected_valid, 1.0)
-    run = functools.partial(
-        kernel.sums,
-        activation=config.activation,
-        tiles=tiles,
-        launch=launch,
-        interpret=interpret,
-    )
-    actor, surrogate = _actor_sums(run, flat["actor"], layout["actor"], samples, config)
-    critic, error = _critic_sums(run, flat["critic"], layout["critic"], samples)
+
+    def run(name: str, loss: Loss) -> tuple[jax.Array, Metrics]:
+        read = {key: getattr(samples, key).astype(jnp.float32) for key in _READ[name]}
+        return kernel.sums(flat[name], layout[name], config.activation, loss, read, tiles, launch)
+
+    surrogate_loss = functools.partial(_surrogate, config, samples.action.shape[1])
+    actor, surrogate = run("actor", surrogate_loss)
+    critic, error = run("critic", _half_square)
     count = error.pop("valid")
     weight = count * share  # weight in the mean of a term that all samples share
     first, width = layout["actor"].vectors["log_std"]
@@ -225,23 +222,6 @@ def flat_gradient(
         "critic": critic * (config.value_cost * share),
     }
     return found, metrics, count
-
-
-def _actor_sums(
-    run: _Run, actor: jax.Array, layout: KernelLayout, samples: Minibatch, config: AlgoConfig
-) -> tuple[jax.Array, Metrics]:
-    """Sums the gradient of the surrogate, and metrics, over samples."""
-    loss = functools.partial(_surrogate, config, samples.action.shape[1])
-    names = ("observation", "action", "log_prob", "advantage", "valid")
-    return run(actor, layout, loss=loss, samples=_samples(samples, names))
-
-
-def _critic_sums(
-    run: _Run, critic: jax.Array, layout: KernelLayout, samples: Minibatch
-) -> tuple[jax.Array, Metrics]:
-    """Sums the gradient of half the squared error, that error and `valid` over samples."""
-    names = ("observation", "return_", "valid")
-    return run(critic, layout, loss=_half_square, samples=_samples(samples, names))
 
 
 def _with_entropy(
@@ -272,23 +252,6 @@ def _layout(network: Params, last: str) -> KernelLayout:
     return KernelLayout(tuple(places), vectors, ends[-1])
 
 
-def _check(samples: Minibatch, layout: dict[str, KernelLayout], config: AlgoConfig) -> None:
-    chex.assert_rank([samples.observation, samples.action], 2)
-    chex.assert_rank([samples.log_prob, samples.valid], 1)
-    chex.assert_equal_shape([samples.log_prob, samples.advantage, samples.return_, samples.valid])
-    chex.assert_equal_shape_prefix([samples.observation, samples.action, samples.valid], 1)
-    observation_size, action_size = samples.observation.shape[1], samples.action.shape[1]
-    for network in layout.values():
-        assert network.layers[0].shape[0] == observation_size
-    assert layout["actor"].vectors["log_std"][1] == action_size
-    if not fits(config, observation_size, action_size):
-        raise ValueError(f"the kernels do not take hidden layers of {config.hidden_sizes}")
-
-
-def _samples(samples: Minibatch, names: tuple[str, ...]) -> Samples:
-    return {name: getattr(samples, name).astype(jnp.float32) for name in names}
-
-
 def _surrogate(
     config: AlgoConfig, size: int, output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
@@ -317,7 +280,7 @@ def _surrogate(
     )
     by_density = jnp.where(valid & (gain <= clipped), -gain, 0.0)[:, None]
     beyond = jnp.where(valid[:, None], gradients.beyond_range(mean), 0.0)
-    slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * config.bound_cost * beyond
+    slope = by_density * standardised * jnp.exp(-log_std) + 2.0 * gradients.BOUND_COST * beyond
     if config.mean_activation == "tanh":
         slope *= 1.0 - mean * mean
     return slope, {
@@ -346,7 +309,7 @@ def _half_square(
 
 
 def learn(
-    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
+    learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of tiles of valid samples.
 

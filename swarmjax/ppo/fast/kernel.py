@@ -157,7 +157,6 @@ def sums(
     samples: Samples,
     tiles: Tiles,
     launch: Launch,
-    interpret: bool = False,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Sums the gradient of a loss, and the loss's other terms, over the samples of some tiles.
 
@@ -173,7 +172,6 @@ def sums(
         input.
       tiles: The tiles to take, each of `launch.tile` samples.
       launch: How the kernel is spread over the GPU.
-      interpret: Whether to run it as ordinary JAX, on any device.
 
     Returns:
       The gradient [n], and the loss's other terms by name, each [].
@@ -189,7 +187,6 @@ def sums(
         out_shape=jax.ShapeDtypeStruct((programs * width,), jnp.float32),
         # Prefetching does not pay: a tile's samples are few bytes compared with its products.
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
-        interpret=interpret,
     )(parameters, samples, tiles)
     total = jnp.sum(totals.reshape(programs, width), axis=0)
     return total[: layout.size], dict(zip(told, total[layout.size :], strict=True))

@@ -55,22 +55,14 @@ class _Rows(NamedTuple):
     exist: jax.Array
 
 
-class _Unit(NamedTuple):
-    """The weights of reset, update and candidate.
+class _Weights(NamedTuple):
+    """The weights of a unit, or three of each: of reset, update and candidate.
 
     Attributes:
-      kernels: [H, H] each, weights of the memory.
-      biases: [H] each, added to the memory's part.
-      biases_seen: [H] each, added to the input's part.
+      kernel: [H, 3 H], or [H, H] each, weights of the memory.
+      bias: [3 H], or [H] each, added to the memory's part.
+      bias_seen: [3 H], or [H] each, added to the input's part.
     """
-
-    kernels: _Three
-    biases: _Three
-    biases_seen: _Three
-
-
-class _Weights(NamedTuple):
-    """The weights of a unit: the memory's kernel [H, 3 H] and bias [3 H], and the input's bias."""
 
     kernel: Any
     bias: Any
@@ -149,7 +141,6 @@ def remember_all(
     features: jax.Array,
     begins: jax.Array,
     memory: jax.Array,
-    interpret: bool = False,
 ) -> jax.Array:
     """Computes the memory of `memory.Gru` after each observation, up to rounding.
 
@@ -162,7 +153,6 @@ def remember_all(
       features: [T, B, F].
       begins: [T, B], whether an episode begins with the step.
       memory: [B, H] before the first step.
-      interpret: Whether to run the kernels as ordinary JAX, on any device.
 
     Returns:
       The memory [T, B, H] after each step.
@@ -172,14 +162,13 @@ def remember_all(
     weights = _Weights(inner["kernel"], inner["bias"], layers["input"]["bias"])
     begun = begins.astype(jnp.float32).ravel()
     seen = (features @ kernel).reshape(-1, kernel.shape[1])
-    return _through(weights, _Sequences(seen, begun, memory), interpret)
+    return _through(weights, _Sequences(seen, begun, memory))
 
 
 def remember(
     layers: Mapping[str, Mapping[str, jax.Array]],
     features: jax.Array,
     memory: jax.Array,
-    interpret: bool = False,
 ) -> jax.Array:
     """Computes the memory of `memory.Gru` after one observation, up to rounding.
 
@@ -187,19 +176,18 @@ def remember(
       layers: As `remember_all` takes them.
       features: [B, F].
       memory: [B, H] before the observation.
-      interpret: Whether to run the kernel as ordinary JAX, on any device.
 
     Returns:
       The memory [B, H] after the observation.
     """
     flat = memory.reshape(-1, memory.shape[-1])
     seen = features.reshape(1, -1, features.shape[-1])
-    after = remember_all(layers, seen, jnp.zeros(seen.shape[:2], bool), flat, interpret)
+    after = remember_all(layers, seen, jnp.zeros(seen.shape[:2], bool), flat)
     return after.reshape(memory.shape)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.Array:
+@jax.custom_vjp
+def _through(weights: _Weights, sequences: _Sequences) -> jax.Array:
     """Runs the unit through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
     steps, tile = len(sequences.seen) // count, _tile(count)
@@ -208,19 +196,18 @@ def _through(weights: _Weights, sequences: _Sequences, interpret: bool) -> jax.A
         grid=(pl.cdiv(count, tile),),
         out_shape=jax.ShapeDtypeStruct((steps * count, size), jnp.float32),
         compiler_params=triton.CompilerParams(num_warps=_WARPS, num_stages=1),
-        interpret=interpret,
     )(weights, sequences)
     return every.reshape(steps, count, size)
 
 
-def _through_forward(weights: _Weights, sequences: _Sequences, interpret: bool) -> tuple[Any, Any]:
+def _through_forward(weights: _Weights, sequences: _Sequences) -> tuple[Any, Any]:
     """Computes `_through`, and keeps what its gradient needs."""
-    every = _through(weights, sequences, interpret)
+    every = _through(weights, sequences)
     return every, (weights, sequences, every)
 
 
 def _through_backward(
-    interpret: bool, kept: tuple[_Weights, _Sequences, jax.Array], slope: jax.Array
+    kept: tuple[_Weights, _Sequences, jax.Array], slope: jax.Array
 ) -> tuple[_Weights, _Sequences]:
     """Backpropagates from the memories [T, B, H] to weights, inputs and first memories."""
     weights, sequences, every = kept
@@ -240,7 +227,6 @@ def _through_backward(
         compiler_params=triton.CompilerParams(
             num_warps=_BACKWARD_WARPS, num_stages=_stages(size, hardware.shared_memory())
         ),
-        interpret=interpret,
     )(weights, sequences, every.reshape(-1, size), slope.reshape(-1, size))
     by_kernel = found["kernel"].reshape(programs, size, 3 * size).sum(axis=0)
     gates, recalled, candidate = jnp.split(found["sums"].sum(axis=0), (2 * size, 3 * size))
@@ -295,7 +281,7 @@ def _backward(
         slopes, by_recalled, by_before = _slopes(later + _load(slope, rows, 0, size), gates, before)
         for gate, value in enumerate(slopes):
             _write(found["seen"], rows, gate * size, value)
-        for value, kernel in zip(by_recalled, unit.kernels, strict=True):
+        for value, kernel in zip(by_recalled, unit.kernel, strict=True):
             by_before = by_before + jnp.dot(value, kernel.T)
         product = tuple(jnp.dot(before.T, value) for value in by_recalled)
         total = tuple(jnp.sum(value, axis=0) for value in (*by_recalled, slopes[2]))
@@ -321,13 +307,13 @@ def _write_sums(
         triton.store(found["sums"].at[program, gate * size + columns], total)
 
 
-def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Unit) -> _Gates:
+def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Weights) -> _Gates:
     """Computes the gates as `memory.remember` does, before it mixes them."""
     size = before.shape[1]
 
     def of(gate: int) -> tuple[jax.Array, jax.Array]:
-        found = _load(seen, rows, gate * size, size) + unit.biases_seen[gate][None, :]
-        return found, jnp.dot(before, unit.kernels[gate]) + unit.biases[gate][None, :]
+        found = _load(seen, rows, gate * size, size) + unit.bias_seen[gate][None, :]
+        return found, jnp.dot(before, unit.kernel[gate]) + unit.bias[gate][None, :]
 
     reset, update = (logistic(jnp.add(*of(gate))) for gate in (0, 1))
     candidate, recalled = of(2)
@@ -377,13 +363,13 @@ def _before(every: Any, memory: Any, step: jax.Array, own: _Rows) -> jax.Array:
     return begun + _load(every, earlier._replace(exist=own.exist & (step > 0)), 0, size)
 
 
-def _read_unit(weights: _Weights) -> _Unit:
+def _read_unit(weights: _Weights) -> _Weights:
     kernel, size = weights.kernel, weights.kernel.shape[0]
     columns = [gate * size + jnp.arange(size) for gate in range(3)]
     rows = jnp.arange(size)[:, None]
     kernels = [triton.load(kernel.at[rows, each[None, :]]) for each in columns]
     biases, seen = ([triton.load(ref.at[each]) for each in columns] for ref in weights[1:])
-    return _Unit((*kernels,), (*biases,), (*seen,))
+    return _Weights((*kernels,), (*biases,), (*seen,))
 
 
 def _load(ref: Any, rows: _Rows, first: int, size: int) -> jax.Array:

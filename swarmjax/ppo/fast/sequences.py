@@ -8,14 +8,14 @@ up.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from swarmjax.ppo import gradients
+from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.fast import blocks
-from swarmjax.ppo.gradients import Learning, Metrics, Minibatch, Progress
+from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.ppo.networks import Params
 from swarmjax.shards import ALONE, Shards
@@ -34,21 +34,8 @@ FEWEST_SEQUENCES = 16
 _TILES = 4
 
 
-class Dealt(NamedTuple):
-    """The useful sequences of a batch, dealt out to minibatches.
-
-    Attributes:
-      order: [Q], int32, all sequences. The sequences of the first minibatch come first, and
-        sequences without a valid sample last.
-      span: [M, 2], int32, where in `order` each minibatch begins and ends.
-    """
-
-    order: jax.Array
-    span: jax.Array
-
-
 def learn(
-    learning: Learning, begun: Progress, samples: Minibatch, key: jax.Array
+    learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
     """Learns from a batch, in minibatches of useful sequences.
 
@@ -66,18 +53,19 @@ def learn(
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
 
     def epoch(progress: Progress, key: jax.Array) -> tuple[Progress, Metrics]:
-        dealt = deal(key, jnp.any(rows.valid, axis=1), config.num_minibatches, shards)
+        useful = jnp.any(rows.valid, axis=1)
+        order, spans = deal(key, useful, config.num_minibatches, shards)
 
         def step(progress: Progress, span: jax.Array) -> tuple[Progress, Metrics]:
-            found = gradient(progress[0], rows, dealt.order, span, learning, expected_valid)
+            found = gradient(progress[0], rows, order, span, learning, expected_valid)
             return gradients.take(learning, progress, found, span[1] > span[0])
 
-        return jax.lax.scan(step, progress, dealt.span)
+        return jax.lax.scan(step, progress, spans)
 
     return jax.lax.scan(epoch, begun, jax.random.split(key, config.epochs))
 
 
-def arrange(samples: Minibatch, steps: int) -> Minibatch:
+def arrange(samples: Batch, steps: int) -> Batch:
     """Lays samples out by sequence.
 
     Args:
@@ -96,7 +84,9 @@ def arrange(samples: Minibatch, steps: int) -> Minibatch:
     return replace(jax.tree.map(by_sequence, replace(samples, memory=NO_MEMORY)), memory=memory)
 
 
-def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE) -> Dealt:
+def deal(
+    key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE
+) -> tuple[jax.Array, jax.Array]:
     """Deals the useful sequences out to minibatches at random.
 
     Each stream of random numbers deals its own sequences out, as evenly as possible, so that a
@@ -110,7 +100,8 @@ def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = A
       shards: How the sequences are spread over devices.
 
     Returns:
-      The minibatches of this device.
+      The order [Q] of all sequences of this device, int32, and the span [M, 2] of each minibatch
+      in it. The sequences of the first minibatch come first, and useless ones last.
     """
     by_stream = useful.reshape(shards.local_streams, -1)
     size = by_stream.shape[1]
@@ -125,12 +116,13 @@ def deal(key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = A
     first = size * jnp.arange(len(by_stream), dtype=jnp.int32)[:, None]
     order = (first + shuffled).ravel()[jnp.argsort(dealt_to.ravel(), stable=True)]
     end = jnp.cumsum(jnp.sum(share + (jnp.arange(minibatches) < rest), axis=0, dtype=jnp.int32))
-    return Dealt(order, jnp.stack([jnp.concatenate([jnp.zeros_like(end[:1]), end[:-1]]), end], 1))
+    begin = jnp.concatenate([jnp.zeros_like(end[:1]), end[:-1]])
+    return order, jnp.stack([begin, end], axis=1)
 
 
 def gradient(
     params: Params,
-    rows: Minibatch,
+    rows: Batch,
     order: jax.Array,
     span: jax.Array,
     learning: Learning,
@@ -159,7 +151,7 @@ def gradient(
             params, tile, learning.networks, config, expected_valid
         )
 
-    return blocks.add_up(tiles_of(span, size), of_tile)
+    return blocks.add_up((span[1] - span[0] + size - 1) // size, of_tile)
 
 
 def tile_size(sequences: int, minibatches: int, steps: int, learners: int) -> int:
@@ -185,14 +177,7 @@ def tile_size(sequences: int, minibatches: int, steps: int, learners: int) -> in
     return -(-fullest // -(-fullest // most))
 
 
-def tiles_of(span: jax.Array, size: int) -> jax.Array:
-    """Counts the tiles, [], that a span [2] of sequences needs, with `size` sequences a tile."""
-    return (span[1] - span[0] + size - 1) // size
-
-
-def take_tile(
-    rows: Minibatch, order: jax.Array, start: jax.Array, end: jax.Array, size: int
-) -> Minibatch:
+def take_tile(rows: Batch, order: jax.Array, start: jax.Array, end: jax.Array, size: int) -> Batch:
     """Takes the sequences of a tile, step by step.
 
     Args:
@@ -210,10 +195,8 @@ def take_tile(
     which = order[jnp.minimum(place, len(order) - 1)]
     tile = jax.tree.map(lambda x: x[which], rows)
     tile = replace(tile, valid=tile.valid.astype(bool) & (place < end)[:, None])
-    flat = jax.tree.map(_by_step, replace(tile, memory=NO_MEMORY))
-    return replace(flat, memory=tile.memory)
 
+    def by_step(x: jax.Array) -> jax.Array:
+        return jnp.moveaxis(x, 1, 0).reshape(-1, *x.shape[2:])
 
-def _by_step(x: jax.Array) -> jax.Array:
-    """Turns sequences [B, T, ...] into samples [T B, ...]."""
-    return jnp.moveaxis(x, 1, 0).reshape(-1, *x.shape[2:])
+    return replace(jax.tree.map(by_step, replace(tile, memory=NO_MEMORY)), memory=tile.memory)

@@ -103,7 +103,10 @@ def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
     weight, mobility = (
         a + of_others(discs, a, len(gap.x)) for a in (robots.weight, robots.mobility)
     )
-    return _contact(discs, gap, rate, weight, mobility)
+    (stiffness, damping), impedance = spring(discs), _impedance(discs, gap.distance)
+    give = jnp.maximum(weight * (1.0 - impedance) / impedance, mujoco.mjMINVAL)
+    demand = -damping * along(gap, rate) - stiffness * impedance * gap.distance
+    return Contact(gap, give, demand, mobility + give)
 
 
 def of_others(discs: Discs, of_robots: Array, contacts: int) -> Array:
@@ -185,25 +188,6 @@ def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
     apart = jnp.sqrt(x * x + y * y)
     along_x = jnp.where(apart > 0.0, x / apart, -ahead)
     return DiscGap(along_x, jnp.where(apart > 0.0, y / apart, 0.0), apart - 2.0 * radius)
-
-
-def _contact(discs: Discs, gap: DiscGap, rate: Motion, weight: Array, mobility: Array) -> Contact:
-    """Computes the parameters of contacts.
-
-    Args:
-      discs: constants.
-      gap: gap between robots and others.
-      rate: velocity of the robots relative to the others, m/s.
-      weight: sum of both inverse weights, 1 / kg.
-      mobility: sum of both 1 / mass, 1 / kg.
-
-    Returns:
-      The contacts.
-    """
-    (stiffness, damping), impedance = spring(discs), _impedance(discs, gap.distance)
-    give = jnp.maximum(weight * (1.0 - impedance) / impedance, mujoco.mjMINVAL)
-    demand = -damping * along(gap, rate) - stiffness * impedance * gap.distance
-    return Contact(gap, give, demand, mobility + give)
 
 
 def along(gap: DiscGap, motion: Motion) -> Array:

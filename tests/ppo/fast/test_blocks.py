@@ -13,7 +13,6 @@ from swarmjax.ppo import gradients, networks
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.fast import blocks
-from swarmjax.ppo.gradients import Minibatch
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 
@@ -25,7 +24,7 @@ OBSERVATION, ACTION = 10, 2
 PPO_ = learners.ppo(CONFIG, Sizes(OBSERVATION, ACTION), 5, "blocks")
 
 
-def _batch(share: float, seed: int = 0) -> Minibatch:
+def _batch(share: float, seed: int = 0) -> Batch:
     """Returns samples [G, N, ...] of which about this share is valid; the others are 0."""
     rng = np.random.default_rng(seed)
     valid = rng.uniform(size=(GROUPS, SAMPLES)) < share
@@ -39,7 +38,7 @@ def _batch(share: float, seed: int = 0) -> Minibatch:
         },
     }
     kept = {k: x * valid.reshape(valid.shape + (1,) * (x.ndim - 2)) for k, x in drawn.items()}
-    return Minibatch(valid=valid, **{k: x.astype(np.float32) for k, x in kept.items()})
+    return Batch(valid=valid, **{k: x.astype(np.float32) for k, x in kept.items()})
 
 
 def _params() -> networks.Params:
@@ -49,10 +48,11 @@ def _params() -> networks.Params:
 @pytest.mark.parametrize(("share", "used"), [(1.0, 3), (0.5, 2), (0.1, 1), (0.0, 0)])
 def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) -> None:
     samples, params = _batch(share), _params()
-    arranged = jax.jit(blocks.arrange)(samples)
-    assert int(arranged.used) == used  # 750, about 375, about 75 and 0 samples, in blocks of 256
+    arranged, filled = jax.jit(blocks.arrange)(samples)
+    assert int(filled) == used  # 750, about 375, about 75 and 0 samples, in blocks of 256
     count = jnp.sum(samples.valid)
-    found = jax.jit(blocks.gradient, static_argnums=2)(params, arranged, PPO_.learning, count)
+    gradient = jax.jit(blocks.gradient, static_argnums=3)
+    found = gradient(params, arranged, filled, PPO_.learning, count)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     whole = jax.jit(jax.grad(gradients.ppo_loss, has_aux=True), static_argnums=(2, 3))
     # float32 rounding: the two gradients add the samples in different orders.
@@ -66,12 +66,12 @@ def test_the_gradient_is_that_of_all_samples_at_once(share: float, used: int) ->
 
 def test_valid_samples_come_first_in_their_order() -> None:
     samples = _batch(0.5)
-    arranged = blocks.arrange(samples)
+    arranged, _ = blocks.arrange(samples)
     valid = samples.valid.reshape(-1)
     kept = samples.advantage.reshape(-1)[valid]
-    np.testing.assert_array_equal(arranged.samples.advantage.reshape(-1)[: len(kept)], kept)
+    np.testing.assert_array_equal(arranged.advantage.reshape(-1)[: len(kept)], kept)
     np.testing.assert_array_equal(
-        arranged.samples.valid.reshape(-1), np.arange(3 * blocks.BLOCK) < len(kept)
+        arranged.valid.reshape(-1), np.arange(3 * blocks.BLOCK) < len(kept)
     )
 
 
@@ -112,6 +112,6 @@ def test_lanes_take_their_turns_and_come_to_what_each_does_alone() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
 
 
-def _to_batch(samples: Minibatch) -> Batch:
+def _to_batch(samples: Batch) -> Batch:
     names = ("observation", "action", "log_prob", "advantage", "return_", "valid")
     return Batch(**{name: jnp.asarray(getattr(samples, name)) for name in names})

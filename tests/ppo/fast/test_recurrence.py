@@ -1,11 +1,11 @@
 """Checks the memory kernels, run as ordinary JAX, against XLA's results and gradients of a GRU."""
 
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import learners
 import numpy as np
 import pytest
 
@@ -27,6 +27,11 @@ def _drawn(*shape: int, seed: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
 
 
+@pytest.fixture(autouse=True)
+def _interpret(monkeypatch: pytest.MonkeyPatch) -> None:
+    learners.interpret_kernels(monkeypatch)
+
+
 def _weights() -> recurrence._Weights:
     kernel = _drawn(SIZE, 3 * SIZE, seed=0) / 4.0
     return recurrence._Weights(kernel, _drawn(3 * SIZE, seed=1), _drawn(3 * SIZE, seed=2))
@@ -39,7 +44,7 @@ def _sequences() -> tuple[jax.Array, jax.Array, jax.Array]:
 
 def _by_kernels(weights: recurrence._Weights, seen: Any, begins: Any, before: Any) -> jax.Array:
     flat = seen.reshape(-1, 3 * SIZE), begins.astype(jnp.float32).ravel(), before
-    return recurrence._through(weights, recurrence._Sequences(*flat), True)
+    return recurrence._through(weights, recurrence._Sequences(*flat))
 
 
 def _by_xla(weights: recurrence._Weights, seen: Any, begins: Any, before: Any) -> jax.Array:
@@ -81,11 +86,7 @@ def test_gradients_are_those_of_the_unit() -> None:
 
 
 def _units() -> tuple[Gru, Gru, Any]:
-    interpreted = SimpleNamespace(
-        remember=partial(recurrence.remember, interpret=True),
-        remember_all=partial(recurrence.remember_all, interpret=True),
-    )
-    plain, fast = Gru(SIZE), Gru(SIZE, kernels=interpreted)
+    plain, fast = Gru(SIZE), Gru(SIZE, kernels=recurrence)
     seen, before = jnp.zeros((ROWS, WIDTH)), jnp.zeros((ROWS, SIZE))
     return plain, fast, plain.init(jax.random.key(0), seen, before)
 
@@ -142,7 +143,10 @@ class TestWhereTheyAreUsed:
     CONFIG = AlgoConfig(memory="gru", memory_size=32)
 
     def bound(self, monkeypatch: pytest.MonkeyPatch, config: AlgoConfig, gpu: bool) -> Any:
-        monkeypatch.setattr(dispatch, "_has_tensor_cores", lambda: gpu)
+        capability = "9.0" if gpu else ""
+        monkeypatch.setattr(
+            jax, "devices", lambda: [SimpleNamespace(compute_capability=capability)]
+        )
         return dispatch.memory_kernels(config)
 
     def test_on_a_gpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
