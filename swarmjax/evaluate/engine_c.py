@@ -138,8 +138,8 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     pose, target, obstacle = (
         x.astype(np.float64) for x in (begun.start, begun.target, begun.obstacle)
     )
-    realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
-    factors = task_factors.draw(begun.seed, realism, robot, judge.spacing.robots, boxes, np)
+    realism, boxes = judge.config.realism, obstacle.shape[1]
+    factors = task_factors.draw(begun.seed, realism, judge.spacing.robots, boxes, np)
     model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, begun.side, strict=True)]
@@ -358,7 +358,7 @@ def look(
     Returns:
       The sensors' view: rays, and the target's distance and bearing.
     """
-    mount, shades = electronics.mount(factors), electronics.reflectance(factors)
-    ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)
+    shades = electronics.reflectance(factors)
+    ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, factors.infrared_yaw)
     bright = None if shades is None else rays.brightness(judge.scene, shades, geom)
     return Sight(ray, bright, *observation.to_target(pose, target, np))

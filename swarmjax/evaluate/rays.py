@@ -39,7 +39,7 @@ def cast_rays(
     data: np.ndarray,
     pose: np.ndarray,
     obstacle: np.ndarray,
-    mount: infrared.Mount | None = None,
+    yaw: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Casts the infrared sensors' rays with MuJoCo.
 
@@ -53,14 +53,14 @@ def cast_rays(
       data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-      mount: Deviations of the sensors' positions and directions.
+      yaw: [A, R, K] by how much each sensor is turned from its nominal yaw, rad.
 
     Returns:
       [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
       of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
-    origin, direction = infrared.rays(pose, np, mount)
+    origin, direction = infrared.rays(pose, np, yaw)
     near = _near(scene, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
     arena, robot, _ = np.nonzero(near)
     origin, direction = origin[near], direction[near]
@@ -132,10 +132,9 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
     """
     model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
     obstacles = scene.ids.obstacle_geom
-    if shades.wall is not None:
-        table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.wall[:, None]
-    if shades.obstacle is not None:
-        table[:, obstacles] = shades.obstacle
+    if shades.fixture is not None:
+        table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.fixture[:, :1]
+        table[:, obstacles] = shades.fixture[:, 1:]
     if shades.robot is not None:
         hulls = [model.geom(f"robot{i}_body").id for i in range(len(scene.ids.hull_body))]
         table[:, hulls] = shades.robot

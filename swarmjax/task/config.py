@@ -124,12 +124,10 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
                 f"realism.{key} is {show(value)}, but robot.hull_radius is {show(hull)} and the "
                 f"wheels lie inside the hull: give less than {show(most)}."
             )
-    stall_time = None if realism.stall is None else realism.stall_time
     for key, value, length, unit in (
         ("action_latency", realism.action_latency, steps, "control steps"),
         ("observation_latency", realism.observation_latency, steps, "control steps"),
         ("infrared_period", realism.infrared_period, seconds, "s"),
-        ("stall_time", stall_time, seconds, "s"),
     ):
         if value is not None and value[1] >= length:
             raise ConfigError(

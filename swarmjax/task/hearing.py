@@ -121,16 +121,6 @@ def listen(
     kept = min(settings.count, robots)
     order = nearest(distance, kept, xp)
     is_there = xp.isfinite(xp.take_along_axis(distance, order, axis=-1))
-    off = _draw(
-        realism.neighbour_distance_noise, noise.normal, seed, clock, Stream.RANGE, robots, xp
-    )
-    if off is not None:
-        distance = xp.maximum(distance + realism.neighbour_distance_noise * off, 0.0)
-    off = _draw(
-        realism.neighbour_bearing_noise, noise.normal, seed, clock, Stream.BEARING, robots, xp
-    )
-    if off is not None:
-        bearing = bearing + realism.neighbour_bearing_noise * off
     parts = [distance, xp.cos(bearing), xp.sin(bearing)]
     rows = [is_there, *(xp.take_along_axis(part, order, axis=-1) for part in parts)]
     found = xp.stack([xp.where(is_there, row, 0.0) for row in rows], axis=-1)

@@ -203,7 +203,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
 ) -> None:
     path, out = steering.write(tmp_path / "policy.npz"), tmp_path / "new" / "result.json"
     words = (f"policy={path}", "stage=s1", "episodes=3", "steps=20", "seed=5", "workers=1")
-    rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.stall=0.01")
+    rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.speed_noise=0.01")
     assert _command(monkeypatch, *words, *rules, f"out={out}") == 0
     result = json.loads(out.read_text())
     assert sorted((path.name for path in out.parent.iterdir()), reverse=True) == [
@@ -219,7 +219,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
     }
     assert result["robot"] == _plain(RobotConfig(body="wheeled", mass=0.2))
     assert result["task"] == _plain(TaskConfig(target_radius=0.06))
-    assert result["cells"][0]["realism"] == _plain(RealismConfig(stall=0.01))
+    assert result["cells"][0]["realism"] == _plain(RealismConfig(speed_noise=0.01))
     assert result["policies"] == [{"path": str(path), "digest": policy.load(path).digest}]
     assert result["versions"]["mujoco"] == mujoco.__version__
     (cell,) = result["cells"]

@@ -64,11 +64,7 @@ def test_mujoco_and_geometry_agree_on_who_is_hidden(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", [pytest.param("ideal", marks=pytest.mark.slow), "real"])
 def test_both_engines_observe_the_same_neighbours_step_by_step(kind: str, tmp_path: Path) -> None:
-    noise: dict[str, Any] = {
-        "packet_loss": 0.4,
-        "neighbour_distance_noise": 0.02,
-        "neighbour_bearing_noise": 0.1,
-    }
+    noise: dict[str, Any] = {"packet_loss": 0.4}
     realism = RealismConfig(**(noise if kind == "real" else {}))
     judge = _judge(tmp_path / "policy.npz", realism=realism)
     task = load_train(WORDS).task

@@ -530,7 +530,7 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     np.testing.assert_array_equal(after.level.seed != state.level.seed, new)
     np.testing.assert_array_equal(after.cohort, new)  # waiting levels are of cohort 1
     seeds, world = np.asarray(after.level.seed), real.world
-    expected = task_factors.draw(seeds, world.realism, world.robot, 3, 1, np)
+    expected = task_factors.draw(seeds, world.realism, 3, 1, np)
     for found, mine in zip(after.factors, expected, strict=True):
         assert found is not None
         assert mine is not None

@@ -92,7 +92,7 @@ def test_a_lost_packet_leaves_no_trace() -> None:
 
 
 def test_noise_of_a_pair_does_not_depend_on_how_many_robots_there_are() -> None:
-    noisy = {"seed": 5, "neighbour_distance_noise": 0.02, "neighbour_bearing_noise": 0.1}
+    noisy = {"seed": 5, "packet_loss": 0.5}
     whole = _listen(np, **noisy)
     fewer = _listen(np, pose=POSE[:3], present=PRESENT[:3], **noisy)
     np.testing.assert_array_equal(fewer, whole[:3])
