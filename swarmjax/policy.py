@@ -44,13 +44,6 @@ class Policy(NamedTuple):
     network: Any = None  # with `meta["network"]`: normalised [..., R, O] to features
     # with `meta["memory"]`: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
     memory: tuple[np.ndarray, ...] | None = None
-    # with `neighbours`: kernel [L, W, E] and bias [L, E] of the layer for them
-    hearing: tuple[np.ndarray, ...] | None = None
-
-    @property
-    def neighbours(self) -> dict[str, Any]:
-        """Neighbour settings: `count` and `range` (m); empty if not used."""
-        return self.meta["observation"].get("neighbours", {})
 
     @property
     def carried(self) -> int:
@@ -118,7 +111,6 @@ def assemble(
         digest=said,
         network=network,
         memory=tuple(arrays[f"actor/memory/{n}"] for n in MEMORY) if "memory" in meta else None,
-        hearing=layer("hearing") if "neighbours" in meta["observation"] else None,
     )
 
 
@@ -211,8 +203,6 @@ def step(
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
     x = (observation.astype(np.float32) - policy.mean[mine]) / policy.std[mine]
     x = (policy.network or np.asarray)(np.clip(x, -limit, limit))
-    if policy.hearing is not None:
-        x = _hear([part[mine] for part in policy.hearing], policy, x)
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _ACTIVATIONS[policy.meta["activation"]](np.vecmat(x, weights[mine]) + offset[mine])
@@ -234,15 +224,6 @@ def _check(policy: Policy, memory: np.ndarray | None, observation: np.ndarray) -
     if getattr(memory, "shape", None) != getattr(expected, "shape", None):
         given, wanted = ("none" if x is None else list(np.shape(x)) for x in (memory, expected))
         raise PolicyError(f"memory is {given}: give {wanted}, as `begin` returns it.")
-
-
-def _hear(parts: list[np.ndarray], policy: Policy, x: np.ndarray) -> np.ndarray:
-    """Returns the observation with its neighbours replaced by the sum of one layer over them."""
-    (kernel, bias), count = parts, policy.neighbours["count"]
-    first = x.shape[-1] - count * kernel.shape[1]
-    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
-    each = _ACTIVATIONS[policy.meta["activation"]](np.matmul(rows, kernel) + bias[:, None])
-    return np.concatenate([x[..., :first], (each * rows[..., :1]).sum(-2)], axis=-1)
 
 
 def _remember(parts: list[np.ndarray], memory: np.ndarray, features: np.ndarray) -> np.ndarray:

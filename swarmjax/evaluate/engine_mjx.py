@@ -29,7 +29,6 @@ from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
 from swarmjax.task import arrival, electronics, env
 from swarmjax.task import stage as task_stage
-from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.env import EnvState, World
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
@@ -102,14 +101,13 @@ def play(
         world,
         steps,
         (trained.encoding, trained.meta["observation"]["limit"]),
-        judge.neighbours(trained),
         (trained.max_speed, trained.max_turn_rate),
         trained.meta["activation"],
         sampled,
         None if trained.network is None else trained.network.module,
     )
     network = None if trained.network is None else trained.network.params
-    weights = trained.layers, trained.mean, trained.std, network, trained.hearing, trained.memory
+    weights = trained.layers, trained.mean, trained.std, network, trained.memory
     memory = policy.begin(trained, levels.present.shape)
     outcome, broken = run(weights, trained.log_std, levels, memory)
     if np.any(broken):
@@ -125,7 +123,6 @@ def _program(
     world: World,
     steps: int,
     seen: tuple[electronics.Encoding, float],
-    heard: NeighboursConfig,
     limits: tuple[float, float],
     activation: str,
     sampled: bool,
@@ -136,14 +133,13 @@ def _program(
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        task=replace(world.task, neighbours=heard),
-        electronics=replace(world.electronics, encoding=encoding, neighbours=heard),
+        electronics=replace(world.electronics, encoding=encoding),
     )
 
     def play(
         weights: Any, log_std: Array, levels: Level, memory: Array | None
     ) -> tuple[Outcome, Array]:
-        mean = partial(_mean_action, activation, limit, weights, network, heard.count)
+        mean = partial(_mean_action, activation, limit, weights, network)
         act = partial(_act, mean, log_std if sampled else None)
         return run(mine, act, levels, steps, memory)[1:]
 
@@ -170,18 +166,15 @@ def _mean_action(
     limit: float,
     weights: Any,
     network: Any,
-    count: int,
     memory: Any,
     observation: Array,
 ) -> tuple[Any, Array]:
     """Computes the actions [E, R, U] of `policy.step` without noise, always in full precision."""
-    layers, mean, std, params, hearing, parts = weights
+    layers, mean, std, params, parts = weights
     robots = slice(observation.shape[-2])
     x = jnp.clip((observation - mean[robots]) / std[robots], -limit, limit)
     if network is not None:
         x = policy_network.features(network, params, x)
-    if hearing is not None:
-        x = _hear(_ACTIVATIONS[activation], hearing, count, x)
     *hidden, last = layers
     for layer in hidden:
         x = _ACTIVATIONS[activation](_dense(x, layer, robots))
@@ -190,15 +183,6 @@ def _mean_action(
         memory = remember(seen, recalled, memory)
         x = jnp.concatenate([x, memory], axis=-1)
     return memory, _dense(x, last, robots)
-
-
-def _hear(activate: Callable[[Array], Array], layer: Any, count: int, x: Array) -> Array:
-    """Computes `policy.step`'s result for the neighbours in x [E, R, O], in full precision."""
-    kernel, bias = (jnp.asarray(part)[: x.shape[-2]] for part in layer)
-    first = x.shape[-1] - count * kernel.shape[1]
-    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
-    each = jnp.matmul(rows, kernel, precision=jax.lax.Precision.HIGHEST) + bias[:, None]
-    return jnp.concatenate([x[..., :first], (activate(each) * rows[..., :1]).sum(-2)], axis=-1)
 
 
 def _dense(x: Array, layer: tuple[ArrayLike, ArrayLike], robots: slice) -> Array:

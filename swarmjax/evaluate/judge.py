@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from swarmjax import extension
-from swarmjax.config import build
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import RayScene
 from swarmjax.extension import Extensions, LevelDrawing, Observation
@@ -22,7 +21,6 @@ from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, shapes
 from swarmjax.task import stage as task_stage
-from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
@@ -92,9 +90,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     example = shapes.expand(example, config.shape)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = task_electronics.load(
-        config.task, config.realism, trained.encoding, own, neighbours(trained)
-    )
+    electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)
     return Judge(
         config=config,
         policy=trained,
@@ -118,11 +114,6 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         substeps=substeps(config),
         own=_look_by(own),
     )
-
-
-def neighbours(trained: Policy) -> NeighboursConfig:
-    """Returns which neighbours a policy observes."""
-    return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 
 def substeps(config: EvaluateConfig) -> int:
@@ -203,7 +194,7 @@ def check_policy(
         extension.check_needs(needs, extensions, str(path), ["level"])
     layout = trained.meta["observation"]
     own = _observations(extensions, trained)
-    for key, expected in observation.describe(trained.encoding, own, neighbours(trained)).items():
+    for key, expected in observation.describe(trained.encoding, own).items():
         given = layout.get(key)
         if given != expected:
             raise PolicyError(

@@ -163,11 +163,6 @@ def _check_form(meta: Mapping[str, Any], form: str, sensors: str) -> None:
         )
     if form != "webots":
         return
-    if "neighbours" in meta["observation"]:
-        raise PolicyError(
-            "format is webots, but the policy observes neighbours, and the controller has no "
-            "board for range and bearing: give format=c or onnx, and your own controller."
-        )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:

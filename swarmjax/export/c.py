@@ -40,7 +40,7 @@ def render(trained: Policy) -> dict[str, bytes]:
     values = _about(trained) | _layout(trained) | _memory(trained)
     files = {
         "policy.h": values,
-        "policy.c": values | _code(trained) | _hearing(trained),
+        "policy.c": values | _code(trained),
         "policy_test.c": values | _cases(trained),
         "Makefile": {},
         "README.md": values | {"observation": export_layout.table(trained)},
@@ -58,7 +58,7 @@ def _about(trained: Policy) -> dict[str, Any]:
     sizes, learners = _sizes(trained), len(trained.mean)
     weights = [part for layer in trained.layers for part in layer]
     arrays = [trained.mean, trained.std, trained.log_std, *weights]
-    arrays += [*(trained.memory or ()), *(trained.hearing or ())]
+    arrays += trained.memory or ()
     parameters = sum(array.size for array in arrays)
     several = f"{learners} policies, one for each robot."
     return {
@@ -81,32 +81,13 @@ def _about(trained: Policy) -> dict[str, Any]:
 
 def _sizes(trained: Policy) -> list[int]:
     """Returns the sizes of the layers, from the input of the first one to the action."""
-    taken = trained.mean.shape[1]
-    if trained.hearing is not None:
-        taken = _first(trained) + trained.hearing[1].shape[1]
-    return [taken, *(bias.shape[1] for _, bias in trained.layers)]
-
-
-def _first(trained: Policy) -> int:
-    """Returns the first entry about neighbours, for a policy that observes neighbours."""
-    assert trained.hearing is not None  # checked by the callers
-    return trained.mean.shape[1] - trained.neighbours["count"] * trained.hearing[0].shape[1]
+    return [trained.mean.shape[1], *(bias.shape[1] for _, bias in trained.layers)]
 
 
 def _widest(trained: Policy) -> int:
     """Returns the largest input size of a layer."""
     *inputs, last, _ = _sizes(trained)
-    return max([trained.mean.shape[1], *inputs, last + trained.carried])
-
-
-def _hearing(trained: Policy) -> dict[str, Any]:
-    """Returns the code about neighbours; empty for a policy that observes none."""
-    if trained.hearing is None:
-        return {"hearing_code": "", "hearing_call": ""}
-    _, row, width = trained.hearing[0].shape
-    sizes = {"row": row, "width": width, "count": trained.neighbours["count"]}
-    code = _fill("hearing.c", sizes | {"first": _first(trained)})
-    return {"hearing_code": code, "hearing_call": "    hear(learner, a);\n"}
+    return max([*inputs, last + trained.carried])
 
 
 def _memory(trained: Policy) -> dict[str, Any]:
@@ -168,8 +149,6 @@ def _arrays(trained: Policy) -> Iterable[str]:
     yield _array("STD", trained.std)
     layers: dict[str, Sequence[np.ndarray]]
     layers = {f"KERNEL_{i} BIAS_{i}": layer for i, layer in enumerate(trained.layers)}
-    if trained.hearing is not None:
-        layers["HEARING_KERNEL HEARING_BIAS"] = trained.hearing
     if trained.memory is not None:
         layers["SEEN_KERNEL SEEN_BIAS"] = trained.memory[:2]
         layers["RECALLED_KERNEL RECALLED_BIAS"] = trained.memory[2:]

@@ -115,7 +115,6 @@ def _graph(policy: Policy) -> _Graph:
     graph.then("Sub", rows(policy.mean))
     graph.then("Div", rows(policy.std))
     graph.then("Clip", graph.constant(-limit), graph.constant(limit))
-    _hear(graph, policy)
     for i, (kernel, bias) in enumerate(policy.layers):
         last = i == len(policy.layers) - 1
         if last and policy.memory is not None:
@@ -136,34 +135,6 @@ def _command(graph: _Graph, policy: Policy) -> None:
     low, high = (np.array(policy.meta["action"][key]) for key in ("low", "high"))
     graph.then("Mul", graph.constant((high - low) / 2))
     graph.then("Add", graph.constant((high + low) / 2), name="command")
-
-
-def _hear(graph: _Graph, policy: Policy) -> None:
-    """Replaces the neighbours' entries with one layer's sum over neighbours, if there are any."""
-    if policy.hearing is None:
-        return
-    (kernel, bias), seen, shared = policy.hearing, graph.value, policy.is_shared
-    count, width = policy.neighbours["count"], kernel.shape[1]
-    first = policy.mean.shape[1] - count * width
-
-    def cut(source: str, start: int, end: int) -> str:
-        """Slices the last axis."""
-        graph.value = source
-        return graph.then("Slice", *(graph.constant([x], np.int64) for x in (start, end, -1)))
-
-    own = cut(seen, 0, first)
-    cut(seen, first, policy.mean.shape[1])
-    leading = [0] if shared else [0, 0]  # 0 keeps the size
-    rows = graph.then("Reshape", graph.constant([*leading, count, width], np.int64))
-    is_there = cut(rows, 0, 1)
-    graph.value = rows
-    graph.then("MatMul", graph.constant(kernel[0] if shared else kernel[:, None]))
-    graph.then("Add", graph.constant(bias[0] if shared else bias[:, None, None]))
-    _activate(graph, policy.meta["activation"])
-    graph.then("Mul", is_there)
-    heard = graph.then("ReduceSum", graph.constant([-2], np.int64), keepdims=0)
-    graph.value = own
-    graph.then("Concat", heard, axis=-1)
 
 
 def _remember(graph: _Graph, parts: tuple[np.ndarray, ...], *, shared: bool) -> None:

@@ -20,7 +20,6 @@ _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since th
 _SMALLEST = float(np.finfo(np.float32).tiny)
 _MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
 _MOST_LOG_STD = 20.0  # 5e8 times the range of commands; exp(89) overflows float32
-_NEIGHBOUR_SIZE = 4  # entries of a neighbour: whether there is one, distance, cosine, sine
 _OWN_ARRAY = re.compile(NETWORK + r"(\w{1,64}/){0,8}\w{1,64}", re.ASCII)
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
@@ -142,11 +141,8 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
     },
     "observation.neighbours": {
         "observation.neighbours": _Rule(
-            "an object without message_size, which c5cd6da is the last commit to read",
-            lambda value: _OBJECT.holds(value) and "message_size" not in value,
+            "none, since 8820a9f is the last commit that reads such a policy", lambda _: False
         ),
-        "observation.neighbours.count": _whole(1, 32),
-        "observation.neighbours.range": _POSITIVE,
     },
 }
 _MISSING = object()
@@ -180,7 +176,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     _check_observation(meta)
     _check_action(meta["action"])
     _check_arrays(arrays, meta)
-    check_reach(arrays, _hidden_layers(arrays, meta), meta, _neighbours(meta))
+    check_reach(arrays, _hidden_layers(arrays, meta), meta)
 
 
 def _value(meta: Mapping[str, Any], field: str) -> Any:
@@ -201,7 +197,7 @@ def _check_fields(meta: Mapping[str, Any], rules: Mapping[str, _Rule]) -> None:
 
 
 def _check_observation(meta: Mapping[str, Any]) -> None:
-    """Checks that the lists of the layout fit each other and the neighbours."""
+    """Checks that the lists of the layout fit each other."""
     layout, names = meta["observation"], meta["observation"]["names"]
     if not names or len(set(names)) < len(names):
         raise PolicyError(
@@ -216,17 +212,6 @@ def _check_observation(meta: Mapping[str, Any]) -> None:
     _check_fields(meta, {"observation.offset": rule, "observation.scale": rule})
     if not np.array(layout["scale"], np.float32).all():
         raise PolicyError("meta.observation.scale holds 0, but it is a divisor.")
-    size = _neighbours(meta) * _NEIGHBOUR_SIZE
-    if size > len(names):
-        raise PolicyError(
-            f"meta.observation.neighbours takes {size} entries, but meta.observation.names "
-            f"has {len(names)}: expected names to include the neighbours' entries."
-        )
-
-
-def _neighbours(meta: Mapping[str, Any]) -> int:
-    """Returns how many neighbours a robot observes."""
-    return meta["observation"].get("neighbours", {"count": 0})["count"]
 
 
 def _check_action(layout: Mapping[str, Any]) -> None:
@@ -301,9 +286,7 @@ def _shapes(
         shapes[f"actor/{layer}/bias"] = (learners, width)
         return width
 
-    depth, neighbours = _hidden_layers(arrays, meta), _neighbours(meta)
-    if neighbours:
-        width += add("hearing", _NEIGHBOUR_SIZE) - neighbours * _NEIGHBOUR_SIZE
+    depth = _hidden_layers(arrays, meta)
     if "network" in meta:  # its layers come first, and only they know how many features they give
         own = {name: array for name, array in arrays.items() if _OWN_ARRAY.fullmatch(name)}
         shapes |= {name: (learners, *array.shape[1:]) for name, array in own.items()}

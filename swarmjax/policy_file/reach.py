@@ -10,9 +10,7 @@ from swarmjax.policy import PolicyError
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-def check_reach(
-    arrays: Mapping[str, np.ndarray], depth: int, meta: Mapping[str, Any], neighbours: int
-) -> None:
+def check_reach(arrays: Mapping[str, np.ndarray], depth: int, meta: Mapping[str, Any]) -> None:
     """Refuses weights with which a sum could overflow float32, and an action become NaN.
 
     The bound of a layer's output is the largest sum of its weights' magnitudes, times the bound of
@@ -23,7 +21,6 @@ def check_reach(
       arrays: the arrays of a policy by name, with sound shapes.
       depth: number of hidden layers.
       meta: the description of the policy, with sound fields.
-      neighbours: number of neighbours that a robot hears.
 
     Raises:
       PolicyError: if a bound is not a number of float32.
@@ -46,10 +43,7 @@ def check_reach(
 
     if any(name.startswith("network/") for name in arrays):
         return
-    bound = limit = float(meta["observation"]["limit"])
-    if neighbours:
-        heard = active(out("hearing", bound))
-        bound = max(bound, neighbours * limit * heard)
+    bound = float(meta["observation"]["limit"])
     for i in range(depth):
         bound = active(out(f"hidden_{i}", bound))
     if "actor/memory/input/kernel" in arrays:

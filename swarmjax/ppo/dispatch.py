@@ -73,8 +73,6 @@ def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
     """Tells whether to use the kernels; refuses `fused` where they are not available."""
     if config.update_backend == "autodiff" or config.critic == "state":
         return False
-    if sizes.hearing is not None:  # the kernels support no layer in front of the hidden ones
-        return False
     possible = _has_tensor_cores()
     fitting = possible and networks.actor.torso is None and _fits(config, sizes)
     if config.update_backend == "fused" and not possible:

@@ -41,7 +41,6 @@ class Stream(enum.IntEnum):
     TARGET_DISTANCE = 36
     TARGET_BEARING = 37
     ACTION = 38
-    PACKET = 39
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:

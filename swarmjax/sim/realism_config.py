@@ -108,9 +108,6 @@ class RealismConfig(Section):
     target_bearing_noise: float | None = setting(
         None, "SD of the bearing, rad; per robot and control step", 0.0, math.pi
     )
-    packet_loss: float | None = setting(
-        None, "probability that a robot misses a neighbour; per pair and control step", 0.0, 1.0
-    )
 
     def _check(self) -> None:
         if self.infrared != "ideal":

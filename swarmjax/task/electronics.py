@@ -17,15 +17,13 @@ from swarmjax.sim.body import Chassis
 from swarmjax.sim.drive import Drive
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import hearing, observation
-from swarmjax.task.config import NeighboursConfig, TaskConfig, resolve_encoding
+from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
-from swarmjax.task.hearing import Heard
 from swarmjax.task.level import Level
 from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
-_DEAF = NeighboursConfig()
 _SLACK = 1e-4  # share of a period, so that rounding does not delay a sample that is due now
 
 
@@ -39,7 +37,6 @@ class Electronics:
       sensor_range: largest infrared distance that is observed, m.
       control_step: s.
       own: observations of an extension, placed after the built-in ones.
-      neighbours: which neighbours are observed.
     """
 
     realism: RealismConfig
@@ -47,12 +44,11 @@ class Electronics:
     sensor_range: float
     control_step: float
     own: tuple[Observation, ...] = ()
-    neighbours: NeighboursConfig = _DEAF
 
     @cached_property
     def layout(self) -> Layout:
         """Names, units and scales of the observation's entries."""
-        return observation.layout(self.encoding, self.own, self.neighbours)
+        return observation.layout(self.encoding, self.own)
 
     @property
     def reach(self) -> float:
@@ -84,7 +80,6 @@ class Sight(NamedTuple):
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
-      heard: neighbours within reach; None if robots do not observe neighbours.
     """
 
     ray: Array
@@ -92,7 +87,6 @@ class Sight(NamedTuple):
     distance: Array
     bearing: Array
     own: Array | None = None
-    heard: Heard | None = None
 
 
 def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) -> View:
@@ -128,7 +122,6 @@ def load(
     realism: RealismConfig,
     encoding: Encoding | None = None,
     own: Sequence[Observation] = (),
-    neighbours: NeighboursConfig | None = None,
 ) -> Electronics:
     """Creates the electronics from the settings.
 
@@ -137,8 +130,6 @@ def load(
       realism: the factors.
       encoding: encoding that the policy was trained with; None for the encoding of the task.
       own: observations of an extension.
-      neighbours: neighbour settings that the policy was trained with; None for the settings of the
-        task.
 
     Returns:
       The electronics.
@@ -149,7 +140,6 @@ def load(
         sensor_range=task.sensor_range,
         control_step=task.control_step,
         own=tuple(own),
-        neighbours=task.neighbours if neighbours is None else neighbours,
     )
 
 
@@ -275,11 +265,7 @@ def _read(
     """Takes readings of all sensors."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
-    heard = None
-    if sight.heard is not None:
-        told = (electronics.neighbours, electronics.realism, factors.seed)
-        heard = hearing.listen(sight.heard, *told, clock, xp)
-    return Readings(sample, distance, bearing, sight.own, heard)
+    return Readings(sample, distance, bearing, sight.own)
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:

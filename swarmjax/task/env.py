@@ -25,7 +25,6 @@ from swarmjax.task import (
     arrival,
     extended,
     geodesic,
-    hearing,
     observation,
     pieces,
     reward,
@@ -399,7 +398,7 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return _hear(world, Sight(ray, bright, distance, bearing), pose, level)
+    return Sight(ray, bright, distance, bearing)
 
 
 def _look_by_extension(
@@ -410,16 +409,6 @@ def _look_by_extension(
         return sight
     view = task_electronics.view(sight, pose, level, arrived, clock)
     return sight._replace(own=extended.look(world.electronics.own, view))
-
-
-def _hear(world: World, sight: Sight, pose: Array, level: Level) -> Sight:
-    """Adds neighbours in reach at poses [R, 3]."""
-    settings = world.electronics.neighbours
-    if not settings.count:
-        return sight
-    hidden = hearing.hidden(pose, level.obstacle, jnp)
-    found = hearing.reachable(pose, level.present, hidden, settings, jnp)
-    return sight._replace(heard=found)
 
 
 def _tally(

@@ -16,7 +16,7 @@ from swarmjax.sim.realism_config import RealismConfig
 Array = Any
 
 # Settings that draw random numbers at every control step. These settings need the seed as well.
-_PER_STEP = ("speed_noise", "target_distance_noise", "target_bearing_noise", "packet_loss")
+_PER_STEP = ("speed_noise", "target_distance_noise", "target_bearing_noise")
 
 
 class Factors(NamedTuple):

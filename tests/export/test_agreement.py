@@ -18,10 +18,8 @@ from swarmjax import outputs, policy
 from swarmjax.export import c as export_c
 from swarmjax.export import onnx as export_onnx
 from swarmjax.policy import Policy
-from swarmjax.ppo import networks
 from swarmjax.ppo.config import AlgoConfig
-from swarmjax.ppo.networks import Hearing, Normalizer, Sizes
-from swarmjax.task.config import NEIGHBOUR_SIZE, NeighboursConfig
+from swarmjax.ppo.networks import Normalizer
 
 OBSERVATIONS = 10_000
 # The required agreement. Sums of 64 float32 terms differ only in their order. This changes actions
@@ -196,59 +194,3 @@ def test_all_forms_of_a_policy_that_remembers_agree_over_a_thousand_steps(
         np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)
     # The memory matters: if it is reset at every step, the same observations give other actions.
     assert np.abs(expected - _by_numpy_steps(trained, seen, begins | True)).max() > 0.1
-
-
-HEARD = 3
-
-
-def _by_flax_hearing(arrays: Arrays, seen: np.ndarray, kind: str, begins: np.ndarray) -> np.ndarray:
-    """Returns actions [T, R, U] of the Flax networks that hear, with or without a memory."""
-    memory = {"memory": "gru", "memory_size": MEMORY} if kind == "gru" else {}
-    size, heard = seen.shape[-1], NeighboursConfig(count=HEARD)
-    place = Hearing(size - heard.size, heard.count, NEIGHBOUR_SIZE)
-    sizes = Sizes(size, 2, hearing=place)
-    nets = networks.make(AlgoConfig(**memory), sizes)
-
-    def act(mine: dict[str, jax.Array], observation: jax.Array) -> jax.Array:
-        def layer(name: str) -> dict[str, jax.Array]:
-            return {part: mine[f"actor/{name}/{part}"] for part in ("kernel", "bias")}
-
-        actor = {name: layer(name) for name in ("hearing", "mean")}
-        actor |= {"torso": {f"hidden_{i}": layer(f"hidden_{i}") for i in range(2)}}
-        actor |= {"log_std": mine["actor/log_std"]}
-        none, began = (), None
-        if kind == "gru":
-            actor["memory"] = {part: layer(f"memory/{part}") for part in ("input", "recurrent")}
-            none, began = jnp.zeros(MEMORY), begins
-        mean, std = (mine[f"normalizer/{name}"] for name in ("mean", "std"))
-        moments = Normalizer(count=jnp.ones(()), mean=mean, variance=std**2, rest=jnp.zeros((2, 1)))
-        features = moments.normalize(observation)
-        return nets.act({"actor": actor}, features, none, began).mean
-
-    mapped = jax.jit(jax.vmap(act, in_axes=(0, 1), out_axes=1))
-    return np.asarray(mapped({name: jnp.asarray(array) for name, array in arrays.items()}, seen))
-
-
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs Debian's package gcc")
-@pytest.mark.parametrize("learners", [1, 3])
-@pytest.mark.parametrize("kind", ["none", "gru"])
-def test_all_forms_of_a_policy_that_hears_agree(kind: str, learners: int, tmp_path: Path) -> None:
-    plain = policies.arrays(hidden=AlgoConfig().hidden_sizes, learners=learners)
-    arrays, said = policies.hearing(plain, HEARD, **several(learners))
-    if kind == "gru":
-        arrays, said = policies.recalling(arrays, MEMORY, **said)
-    trained = saved(tmp_path / "policy.npz", arrays, **said)
-    seen = policies.seen(trained, STEPS)
-    begins = np.arange(STEPS) % 300 == 0
-    expected = _by_numpy_steps(trained, seen, begins)
-    remembers = kind == "gru"
-    found = {
-        "Flax": _by_flax_hearing(arrays, seen, kind, begins),
-        "ONNX": _by_onnx_steps(trained, seen, begins) if remembers else _by_onnx(trained, seen),
-        "C": _by_c_steps(trained, seen, begins, tmp_path / "c")
-        if remembers
-        else _by_c(trained, seen, tmp_path / "c"),
-    }
-    assert expected.shape == (STEPS, learners, 2)
-    for name, action in found.items():
-        np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE, err_msg=name)

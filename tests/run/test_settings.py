@@ -235,13 +235,6 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[s1,grid]"], "stage.sequence is grid, which names several stages: "
          "give single stages."),
         # Checks across keys.
-        (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
-        (["task.neighbours.count=2", "algo.update_backend=fused"], "algo.update_backend is fused, "
-         "but task.neighbours.count is 2: give auto or autodiff, or task.neighbours.count=0."),
-        (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
-         "task.neighbours.count is 2, which works only with hidden layers: give algo.network=mlp "
-         "or task.neighbours.count=0."),
-        (["realism.packet_loss=1.5"], "realism.packet_loss is 1.5: give 0 to 1."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
         (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "

@@ -44,7 +44,6 @@ STEP: dict[str, Any] = {
     "speed_noise": 0.05,
     "target_distance_noise": 0.005,
     "target_bearing_noise": 0.0524,
-    "packet_loss": 0.85,
 }
 SHAPES = {
     "seed": (),

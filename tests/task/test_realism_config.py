@@ -49,7 +49,6 @@ REAL = {
     "observation_latency": (0, 1),
     "target_distance_noise": 0.005,
     "target_bearing_noise": 0.0524,  # 3 degrees: 3 * 3.1416 / 180 = 0.05236
-    "packet_loss": 0.85,
 }
 FACTORS = sorted(REAL.keys() - {"name", "infrared"})
 LOADS = [load_train, lambda words: load_levels(EvaluateConfig, ["policy=p", *words])]

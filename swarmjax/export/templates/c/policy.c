@@ -48,7 +48,7 @@ void policy_observe(const float quantity[POLICY_OBSERVATIONS],
     }
 }
 
-${hearing_code}${memory_code}void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
+${memory_code}void policy_action(unsigned learner, const float observation[POLICY_OBSERVATIONS],
                    ${memory_parameter}float action[POLICY_ACTIONS])
 {
     float a[WIDEST], b[WIDEST];
@@ -56,7 +56,7 @@ ${hearing_code}${memory_code}void policy_action(unsigned learner, const float ob
     for (unsigned i = 0; i < POLICY_OBSERVATIONS; i++) {
         a[i] = clip((observation[i] - MEAN[learner][i]) / STD[learner][i], $limit);
     }
-${hearing_call}$layers
+$layers
 }
 
 void policy_sample(unsigned learner, const float normal[POLICY_ACTIONS],
