@@ -116,7 +116,6 @@ def _show(console: Console, suite: Suite) -> None:
         "robots",
         "obstacles",
         "side",
-        "shape",
         "realism",
         "friction",
         "steps",
@@ -135,7 +134,7 @@ def _row(cell: Cell) -> list[str]:
     lost = np.isinf(trials.ways(EvaluateConfig(policy="", stage=stage), cell.levels))
     numbers = (stage.robots, stage.obstacles, f"{'-'.join(f'{x:g}' for x in set(stage.sides))} m")
     friction = "-" if cell.hull_friction is None else f"{cell.hull_friction:g}"
-    words = (cell.shape, cell.realism or "-", friction, cell.steps or "-")
+    words = (cell.realism or "-", friction, cell.steps or "-")
     counts = (len(cell.episodes), int(lost.any(axis=-1).sum()))
     return [str(each) for each in (cell.name, *numbers, *words, *counts, cell.digest[:12])]
 

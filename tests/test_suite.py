@@ -24,7 +24,6 @@ cells:
     stage: {robots: 2, side: 0.6, obstacles: 1}
     levels: 3
     seed: 1000002
-    shape: cross
 """
 
 

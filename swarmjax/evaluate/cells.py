@@ -19,11 +19,10 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, SuiteFileConfig, read_suite
 from swarmjax.extension import LevelDrawing
 from swarmjax.outputs import replacing
-from swarmjax.task import level, shapes
+from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.level import Level
-from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 2
@@ -37,18 +36,16 @@ class Cell(NamedTuple):
     Attributes:
       name: Name of the cell.
       stage: Settings of the stage.
-      shape: Shape of the obstacles.
       realism: Name of a preset, or None for the command's preset.
       seed: Seed of the levels.
       episodes: [E] numbers of the levels.
-      levels: [E] levels, in which each obstacle is given as the boxes that it consists of.
+      levels: [E] levels.
       steps: Control steps of an episode, or None for the command's number.
       hull_friction: Friction of the robots' hulls, or None for the command's value.
     """
 
     name: str
     stage: StageConfig
-    shape: Shape
     realism: str | None
     seed: int
     episodes: np.ndarray
@@ -152,28 +149,26 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
     Returns:
       The cell, under the stage's name.
     """
-    stage, shape = config.stage, config.shape
-    radii = (config.robot.hull_radius, config.task.target_radius)
+    stage, radii = config.stage, (config.robot.hull_radius, config.task.target_radius)
     drawings = extension.load(config.extensions).levels
-    levels = _draw(stage, shape, config.seed, numbers, radii, drawings)
-    return Cell(stage.name, stage, shape, None, config.seed, np.array(numbers), levels)
+    levels = _draw(stage, config.seed, numbers, radii, drawings)
+    return Cell(stage.name, stage, None, config.seed, np.array(numbers), levels)
 
 
 def draw_cell(cell: CellConfig) -> Cell:
     """Draws the levels of a suite's cell, without checking the cell's digest."""
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
-    levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
+    levels = _draw(cell.stage, cell.seed, numbers, radii)
     return _cell(cell, np.array(numbers), levels)
 
 
 def _cell(cell: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
-    about = (cell.name, cell.stage, cell.shape, cell.realism, cell.seed)
+    about = (cell.name, cell.stage, cell.realism, cell.seed)
     return Cell(*about, episodes, levels, cell.steps, cell.hull_friction)
 
 
 def _draw(
     stage: StageConfig,
-    shape: Shape,
     seed: int,
     numbers: Sequence[int],
     radii: tuple[float, float],
@@ -182,8 +177,7 @@ def _draw(
     """Draws levels with these numbers, for hulls and targets with these radii, m."""
     one = task_stage.single(stage, drawings)
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
-    draw = judge.draw_level
-    drawn = [shapes.expand(draw(one, spacing, seed, each, drawings), shape) for each in numbers]
+    drawn = [judge.draw_level(one, spacing, seed, each, drawings) for each in numbers]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
 
 
@@ -218,7 +212,7 @@ def write(path: Path, suite: Suite) -> None:
       ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
-    keys = ("name", "shape", "realism", "seed", "digest", "steps", "hull_friction")
+    keys = ("name", "realism", "seed", "digest", "steps", "hull_friction")
     about = [
         {"stage": to_dict(cell.stage), "levels": len(cell.episodes)}
         | {key: getattr(cell, key) for key in keys}

@@ -19,7 +19,7 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import physics_substeps
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import level, observation, shapes
+from swarmjax.task import level, observation
 from swarmjax.task import stage as task_stage
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
@@ -71,8 +71,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m. None means the half edges that
-        stage and `shape` give.
+      half: [M, 2] half edges of the boxes in the coming levels, m. None means those of the
+        stage's first level.
 
     Returns:
       The judge.
@@ -87,7 +87,6 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
-    example = shapes.expand(example, config.shape)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
     electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)

@@ -11,7 +11,6 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
 from swarmjax.sim.config import MOST_HULL_FRICTION, RobotConfig
 from swarmjax.task import stage_files
-from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
 
 # Seeds of a suite's levels begin here. People and benchmarks choose small seeds, so they draw other
@@ -39,7 +38,6 @@ class CellConfig(Section):
     hull_friction: float | None = setting(
         None, "of the robots; null: the command's", 0.0, MOST_HULL_FRICTION
     )
-    shape: Shape = setting("box", "of the obstacles")
     digest: str | None = setting(None, "SHA-256 of the levels; null: not drawn yet")
 
     def _check(self) -> None:
@@ -56,10 +54,6 @@ class CellConfig(Section):
             build(
                 RobotConfig, {"hull_friction": self.hull_friction}
             )  # which checks the lower bound too
-        if self.shape != "box" and self.stage.level == "fixed":
-            raise ConfigError(
-                f"shape is {self.shape}, but the stage's level is fixed: give shape=box."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -239,7 +239,7 @@ def suite(tmp_path: Path) -> Path:
     file.write_text(
         "name: tiny\ncells:\n"
         "  - {name: one, stage: s1, levels: 4, seed: 1000001}\n"
-        "  - {name: two, stage: s3, levels: 5, seed: 1000002, shape: bar, realism: webots}\n"
+        "  - {name: two, stage: s3, levels: 5, seed: 1000002, realism: webots}\n"
     )
     drawn = [cells.draw_cell(each) for each in read_suite(str(file)).cells]
     cells.write(tmp_path / "tiny.npz", cells.Suite("tiny", tuple(drawn)))
