@@ -19,7 +19,7 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import physics_substeps
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import level, observation
+from swarmjax.task import level, observation, room
 from swarmjax.task import stage as task_stage
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
@@ -87,6 +87,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
+    if config.stage.kind is not None:
+        room.check_level(config.stage, example, spacing)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
     electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)

@@ -186,22 +186,6 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
-        numbers = {key: _ends(getattr(self, key))[1] for key in layout.reads}
-        sizes = {"side": self.sides[0], "breadth": _ends(self.breadth or self.side)[0]}
-        demand = {"robots": self.robots, **sizes, **numbers}
-        for (key, found), least in zip(sizes.items(), layout.least(demand), strict=True):
-            if found < least - 1e-9:
-                with_ = " ".join(f"{key}={show(getattr(self, key))}" for key in layout.reads)
-                raise ConfigError(
-                    f"{key} is {show(getattr(self, key) or self.side)}, too small for level="
-                    f"{self.level} with robots={self.robots} and {with_}: give at least "
-                    f"{math.ceil(100 * least - 1e-6) / 100}."
-                )
-
-    def smallest(self, key: str) -> float | None:
-        """Returns the smaller end of a layout's number, m; None if it is not set."""
-        given = getattr(self, key)
-        return None if given is None else _ends(given)[0]
 
     @property
     def kind(self) -> Kind | None:
