@@ -13,7 +13,9 @@ from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 
 _TRIED = 16  # levels of a stage to check
-_THINGS = dict(zip(gaps.KINDS, ("another robot", "an obstacle", "a wall"), strict=True))
+_THINGS: dict[str, str] = dict(
+    zip(gaps.KINDS, ("another robot", "an obstacle", "a wall"), strict=True)
+)
 
 
 def check(
