@@ -147,7 +147,7 @@ def _trial(name: str, *, seed: int = 1_000_000, first: int = 0, **stage: Any) ->
     numbers = np.arange(first, first + 10)
     plain = StageConfig(**({"name": name, "robots": 2, "side": 1.0} | stage))
     levels: Any = None
-    cell = Cell(name, plain, "box", None, seed, numbers, levels)
+    cell = Cell(name, plain, None, seed, numbers, levels)
     found = {"spl": np.random.default_rng(first).random((1, 10))}
     return Trial(cell, np.ones((10, 2)), found)
 

@@ -536,11 +536,10 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
         assert mine is not None
         # The tolerance covers the rounding of low + u * (high - low), and of log and cos.
         np.testing.assert_allclose(found, mine, rtol=2e-6, atol=1e-6)
-    # Nothing of the old episode is left: no command is queued or held, and the stored observations
-    # are the current one.
-    motor, infrared, seen = jax.tree.map(np.asarray, after.memory)
-    assert motor.queue[~new, 0].all()
-    assert not motor.queue[new].any()
-    assert not motor.held[new].any()
+    # Nothing of the old episode is left: no command is queued, and the stored observations are the
+    # current one.
+    commands, infrared, seen = jax.tree.map(np.asarray, after.memory)
+    assert commands[~new, 0].all()
+    assert not commands[new].any()
     np.testing.assert_array_equal(seen[new, 0], after.observation[new])
     np.testing.assert_array_equal(infrared[new], after.observation[new][..., INFRARED])
