@@ -39,7 +39,6 @@ def test_stages_are_the_table_of_the_plan():
         "s4": (3, 1.0, 2),
         "s5": (5, 1.0, 2),
         "s6": (5, 1.2, 3),
-        "final": (5, 1.2, 3),
         "expanded": (5, 1.5, 3),
     }
     for name, numbers in table.items():
@@ -50,7 +49,7 @@ def test_stages_are_the_table_of_the_plan():
 
 def test_every_stage_file_can_be_trained():
     files = {path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")}
-    assert files >= {"curriculum", "worlds", "final", "expanded"}
+    assert files >= {"curriculum", "worlds", "expanded"}
     for name in files:
         train = load_train([f"stage={name}", "sim.max_robots=100", "sim.max_obstacles=32"])
         assert train.stage_name == name
