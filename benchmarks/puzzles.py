@@ -255,7 +255,7 @@ def make_cell(puzzles: Sequence[Draw], edge: float) -> Cell:
     drawn = [to_level(each, edge, stage.obstacles) for each in puzzles]
     levels = Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
     episodes = np.array([each.number for each in puzzles])
-    return Cell(stage.name, stage, "box", None, SEED, episodes, levels, STEPS)
+    return Cell(stage.name, stage, None, SEED, episodes, levels, STEPS)
 
 
 def _stage(rows: Sequence[str], robots: int, edge: float) -> StageConfig:

@@ -39,13 +39,6 @@ class Policy(NamedTuple):
     network: Any = None  # with `meta["network"]`: normalised [..., R, O] to features
     # with `meta["memory"]`: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
     memory: tuple[np.ndarray, ...] | None = None
-    # with `neighbours`: kernel [L, W, E] and bias [L, E] of the layer for them
-    hearing: tuple[np.ndarray, ...] | None = None
-
-    @property
-    def neighbours(self) -> dict[str, Any]:
-        """Neighbour settings: `count` and `range` (m); empty if not used."""
-        return self.meta["observation"].get("neighbours", {})
 
     @property
     def carried(self) -> int:
@@ -113,7 +106,6 @@ def assemble(
         digest=said,
         network=network,
         memory=tuple(arrays[f"actor/memory/{n}"] for n in MEMORY) if "memory" in meta else None,
-        hearing=layer("hearing") if "neighbours" in meta["observation"] else None,
     )
 
 
@@ -204,8 +196,6 @@ def step(
     x = xp.clip(x, -limit, limit)
     if policy.network is not None:
         x = policy.network(x)
-    if policy.hearing is not None:
-        x = _hear([part[mine] for part in policy.hearing], policy, x, xp)
     *hidden, (kernel, bias) = policy.layers
     for weights, offset in hidden:
         x = _activate(policy, xp.vecmat(x, weights[mine]) + offset[mine], xp)
@@ -234,15 +224,6 @@ def _check(policy: Policy, memory: Any, observation: Any) -> None:
     if getattr(memory, "shape", None) != getattr(expected, "shape", None):
         given, wanted = ("none" if x is None else list(np.shape(x)) for x in (memory, expected))
         raise PolicyError(f"memory is {given}: give {wanted}, as `begin` returns it.")
-
-
-def _hear(parts: list[Any], policy: Policy, x: Any, xp: Any) -> Any:
-    """Returns the observation with its neighbours replaced by the sum of one layer over them."""
-    (kernel, bias), count = parts, policy.neighbours["count"]
-    first = x.shape[-1] - count * kernel.shape[1]
-    rows = x[..., first:].reshape(*x.shape[:-1], count, kernel.shape[1])
-    each = _activate(policy, xp.matmul(rows, kernel) + bias[:, None], xp)
-    return xp.concatenate([x[..., :first], (each * rows[..., :1]).sum(-2)], axis=-1)
 
 
 def _remember(parts: list[Any], memory: Any, features: Any, xp: Any) -> Any:

@@ -12,7 +12,6 @@ from swarmjax import epuck, policy, policy_file
 from swarmjax.export import webots_controller
 from swarmjax.policy import Policy
 from swarmjax.task import observation
-from swarmjax.task.config import NEIGHBOUR_SIZE, NeighboursConfig
 
 Arrays = dict[str, np.ndarray]
 Names = tuple[str, ...]
@@ -83,26 +82,6 @@ def remembering(given: Arrays, size: int, seed: int = 1) -> Arrays:
 def recalling(given: Arrays, size: int, **said: Any) -> tuple[Arrays, dict[str, Any]]:
     """Returns these networks with a memory of `size` numbers, and their `meta`."""
     return remembering(given, size), said | {"memory": {"kind": "gru", "size": size}}
-
-
-def hearing(given: Arrays, count: int, seed: int = 3, **said: Any) -> tuple[Arrays, dict[str, Any]]:
-    """Returns these networks with inputs from neighbours, and their `meta`."""
-    heard = NeighboursConfig(count=count)
-    draw, found = np.random.default_rng(seed), dict(given)
-    learners, _, width = given["actor/hidden_0/kernel"].shape
-
-    def drawn(*shape: int) -> np.ndarray:
-        return draw.normal(size=(learners, *shape)).astype(np.float32) / np.float32(shape[0] ** 0.5)
-
-    found["actor/hearing/kernel"] = drawn(NEIGHBOUR_SIZE, width)
-    found["actor/hearing/bias"] = 0.1 * drawn(width)
-    more = {"actor/hidden_0/kernel": (drawn(width, width), 1)}
-    more |= {"normalizer/mean": (np.zeros((learners, heard.size), np.float32), 1)}
-    more |= {"normalizer/std": (np.ones((learners, heard.size), np.float32), 1)}
-    for name, (part, axis) in more.items():
-        found[name] = np.concatenate([given[name], part], axis=axis)
-    layout = observation.describe("metric", (), heard) | {"limit": 10.0}
-    return found, said | {"observation": layout}
 
 
 def several(learners: int) -> dict[str, Any]:

@@ -12,13 +12,8 @@ MODES = ("sequential", "mixed", "adaptive")
 _STEPWISE, _ADAPTIVE = MODES[:2], MODES[2:]
 # The modes that read an option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
-    "threshold": ("mode", _STEPWISE),
-    "budget_share": ("mode", _STEPWISE),
-    "optimizer": ("mode", _STEPWISE),
-    "exploration": ("mode", _STEPWISE),
-    "score": ("mode", _ADAPTIVE),
-    "floor": ("mode", _ADAPTIVE),
-    "shares": ("mode", _ADAPTIVE),
+    **dict.fromkeys(("threshold", "budget_share", "optimizer", "exploration"), ("mode", _STEPWISE)),
+    **dict.fromkeys(("score", "floor", "shares"), ("mode", _ADAPTIVE)),
 }
 
 

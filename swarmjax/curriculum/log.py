@@ -30,18 +30,12 @@ def _entry(row: dict, names: Sequence[str]) -> dict:
     """Describes the decision of an update, with the figures behind it."""
     why = {"why": REASONS[row["decision"]]}
     if row["decision"] == REWEIGHED:
-        weights, success = row["weights"], row["estimate_by_stage"]
-        return why | {
-            "weights": dict(zip(names, weights, strict=True)),
-            "success": dict(zip(names, success, strict=True)),
-        }
+        figures = {"weights": row["weights"], "success": row["estimate_by_stage"]}
+        return why | {key: dict(zip(names, each, strict=True)) for key, each in figures.items()}
     left = row["decided_stage"]
+    figures = {"targets_reached": "success", "all_reached": "complete", "episodes": "episodes"}
     return (
         {"from": names[left], "to": names[row["next_stage"]]}
         | why
-        | {
-            "targets_reached": row["success_by_stage"][left],
-            "all_reached": row["complete_by_stage"][left],
-            "episodes": row["episodes_by_stage"][left],
-        }
+        | {key: row[f"{figure}_by_stage"][left] for key, figure in figures.items()}
     )

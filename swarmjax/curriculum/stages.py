@@ -197,7 +197,7 @@ def adaptive(
       The choice from the next update on; its newest stage is the last one.
     """
     stages = state.chosen.weights.shape[0]
-    score = _SCORES[options.score](verdict.record)
+    score = _score(verdict.record, options.score)
     total = jnp.sum(score)
     share = jnp.where(total > 0.0, score / jnp.where(total > 0.0, total, 1.0), 1.0 / stages)
     floor = jnp.asarray(schedule.floor)
@@ -214,15 +214,12 @@ def adaptive(
     )
 
 
-def _learnability(record: Record) -> Array:
-    return jnp.where(
-        jnp.isfinite(record.fast), record.fast * (1.0 - record.fast), _UNKNOWN_LEARNABILITY
-    )
+def _score(record: Record, score: str) -> Array:
+    """Returns the score [S] of each stage; a stage without a verdict has the largest score."""
+    known, success = jnp.isfinite(record.fast), record.fast
+    if score == "failure":
+        return 1.0 - jnp.where(known, success, 0.0)
+    return jnp.where(known, success * (1.0 - success), _UNKNOWN_LEARNABILITY)
 
 
-def _failure(record: Record) -> Array:
-    return 1.0 - jnp.where(jnp.isfinite(record.fast), record.fast, 0.0)
-
-
-_SCORES = {"learnability": _learnability, "failure": _failure}
 MODES: dict[str, Mode] = {"sequential": promoting, "mixed": promoting, "adaptive": adaptive}

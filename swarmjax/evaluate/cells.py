@@ -19,11 +19,10 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import CellConfig, SuiteFileConfig, read_suite
 from swarmjax.extension import LevelDrawing
 from swarmjax.outputs import replacing
-from swarmjax.task import level, shapes
+from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.level import Level
-from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 FORMAT = 2
@@ -36,18 +35,16 @@ class Cell(NamedTuple):
     Attributes:
       name: Name of the cell.
       stage: Settings of the stage.
-      shape: Shape of the obstacles.
       realism: Name of a preset, or None for the command's preset.
       seed: Seed of the levels.
       episodes: [E] numbers of the levels.
-      levels: [E] levels, in which each obstacle is given as the boxes that it consists of.
+      levels: [E] levels.
       steps: Control steps of an episode, or None for the command's number.
       hull_friction: Friction of the robots' hulls, or None for the command's value.
     """
 
     name: str
     stage: StageConfig
-    shape: Shape
     realism: str | None
     seed: int
     episodes: np.ndarray
@@ -133,11 +130,10 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
     Returns:
       The cell, under the stage's name.
     """
-    stage, shape = config.stage, config.shape
-    radii = (config.robot.hull_radius, config.task.target_radius)
+    stage, radii = config.stage, (config.robot.hull_radius, config.task.target_radius)
     drawings = extension.load(config.extensions).levels
-    levels = _draw(stage, shape, config.seed, numbers, radii, drawings)
-    return Cell(stage.name, stage, shape, None, config.seed, np.array(numbers), levels)
+    levels = _draw(stage, config.seed, numbers, radii, drawings)
+    return Cell(stage.name, stage, None, config.seed, np.array(numbers), levels)
 
 
 def draw_cell(cell: CellConfig) -> Cell:
@@ -147,13 +143,13 @@ def draw_cell(cell: CellConfig) -> Cell:
       ConfigError: The cell has another digest.
     """
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
-    levels = _draw(cell.stage, cell.shape, cell.seed, numbers, radii)
+    levels = _draw(cell.stage, cell.seed, numbers, radii)
     return _cell(cell, np.array(numbers), levels)
 
 
 def _cell(settings: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
     """Makes a cell, and checks its digest if its settings have one."""
-    about = (settings.name, settings.stage, settings.shape, settings.realism, settings.seed)
+    about = (settings.name, settings.stage, settings.realism, settings.seed)
     cell = Cell(*about, episodes, levels, settings.steps, settings.hull_friction)
     if settings.digest not in (None, cell.digest):
         raise ConfigError(
@@ -165,7 +161,6 @@ def _cell(settings: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
 
 def _draw(
     stage: StageConfig,
-    shape: Shape,
     seed: int,
     numbers: Sequence[int],
     radii: tuple[float, float],
@@ -174,8 +169,7 @@ def _draw(
     """Draws levels with these numbers, for hulls and targets with these radii, m."""
     one = task_stage.single(stage, drawings)
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
-    draw = judge.draw_level
-    drawn = [shapes.expand(draw(one, spacing, seed, each, drawings), shape) for each in numbers]
+    drawn = [judge.draw_level(one, spacing, seed, each, drawings) for each in numbers]
     return Level(*(np.stack(fields) for fields in zip(*drawn, strict=True)))
 
 
@@ -202,7 +196,7 @@ def write(path: Path, suite: Suite) -> None:
       ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
-    keys = ("name", "shape", "realism", "seed", "digest", "steps", "hull_friction")
+    keys = ("name", "realism", "seed", "digest", "steps", "hull_friction")
     about = [
         {"stage": to_dict(cell.stage), "levels": len(cell.episodes)}
         | {key: getattr(cell, key) for key in keys}

@@ -9,7 +9,6 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
-from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig
 
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
@@ -36,7 +35,6 @@ class JudgeConfig(Section):
     suite: str | None = setting(
         None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"
     )
-    shape: Shape = setting("box", "shape of a random level's obstacles")
     realism: RealismConfig = field(default_factory=RealismConfig)
     action: Literal["sampled", "mean"] = setting(
         "sampled",
@@ -88,10 +86,5 @@ class EvaluateConfig(JudgeConfig):
             raise ConfigError(
                 f"policy is {show(self.policy)} and compare is {show(self.compare)}: give one of "
                 "them, policy=FILE or compare=FILE,FILE."
-            )
-        if self.shape != "box" and self.stage.level == "fixed":
-            raise ConfigError(
-                f"shape is {self.shape}, but stage.level is fixed, with obstacles of its own: "
-                "give shape=box."
             )
         super()._check()

@@ -27,7 +27,7 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.noise import Stream
-from swarmjax.task import arrival, electronics, hearing, level, observation
+from swarmjax.task import arrival, electronics, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
@@ -137,14 +137,14 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     pose, target, obstacle = (
         x.astype(np.float64) for x in (begun.start, begun.target, begun.obstacle)
     )
-    realism, robot, boxes = judge.config.realism, judge.config.robot, obstacle.shape[1]
-    factors = task_factors.draw(begun.seed, realism, robot, judge.spacing.robots, boxes, np)
+    realism, boxes = judge.config.realism, obstacle.shape[1]
+    factors = task_factors.draw(begun.seed, realism, judge.spacing.robots, boxes, np)
     model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, begun.side, strict=True)]
     outcome = measures.begin(pose[..., :2], np)
     sight = look(judge, data, factors, pose, target, obstacle)
-    sight = _look_further(judge, sight, data, pose, obstacle, begun, outcome.arrived, outcome.clock)
+    sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -248,9 +248,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
     clock = arenas.outcome.clock + 1
-    sight = _look_further(
-        judge, sight, arenas.data, pose, arenas.obstacle, arenas.level, arrived, clock
-    )
+    sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     events = measures.Events(
         start=arenas.pose[..., :2],
@@ -264,26 +262,18 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
     return arenas._replace(memory=memory, pose=pose, observation=seen, apart=apart, outcome=outcome)
 
 
-def _look_further(
+def _look_by_extension(
     judge: Judge,
     sight: Sight,
-    data: np.ndarray,
     pose: np.ndarray,
-    obstacle: np.ndarray,
     levels: Level,
     arrived: np.ndarray,
     clock: np.ndarray,
 ) -> Sight:
-    """Adds the observations of an extension, and the neighbours in range."""
-    if judge.own is not None:
-        view = electronics.view(sight, pose, levels, arrived, clock)
-        sight = sight._replace(own=judge.own(view))
-    settings = judge.electronics.neighbours
-    if not settings.count:
+    """Adds the observations of an extension."""
+    if judge.own is None:
         return sight
-    hidden = rays.hidden(judge.scene, data, pose, obstacle, settings.range)
-    # In the judge every robot is present.
-    return sight._replace(heard=hearing.reachable(pose, levels.present, hidden, settings, np))
+    return sight._replace(own=judge.own(electronics.view(sight, pose, levels, arrived, clock)))
 
 
 def _drive(
@@ -345,7 +335,7 @@ def look(
     Returns:
       The sensors' view: rays, and the target's distance and bearing.
     """
-    mount, shades = electronics.mount(factors), electronics.reflectance(factors)
-    ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, mount)
+    shades = electronics.reflectance(factors)
+    ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, factors.infrared_yaw)
     bright = None if shades is None else rays.brightness(judge.scene, shades, geom)
     return Sight(ray, bright, *observation.to_target(pose, target, np))

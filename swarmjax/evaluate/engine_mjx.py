@@ -34,7 +34,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import rollout
 
 _ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
-_WEIGHTS = ("layers", "log_std", "mean", "std", "memory", "hearing")
+_WEIGHTS = ("layers", "log_std", "mean", "std", "memory")
 
 
 def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
@@ -130,12 +130,10 @@ def _program(
         meta=meta,
         digest="",
     )
-    heard = judge.neighbours(bare)
     mine = replace(
         world,
         drive=world.drive._replace(max_speed=speed, max_turn_rate=turn_rate),
-        task=replace(world.task, neighbours=heard),
-        electronics=replace(world.electronics, encoding=layout["encoding"], neighbours=heard),
+        electronics=replace(world.electronics, encoding=layout["encoding"]),
     )
 
     @jax.jit

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from swarmjax import extension
-from swarmjax.config import build
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import RayScene
 from swarmjax.extension import Extensions, LevelDrawing, Observation
@@ -20,9 +19,8 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import physics_substeps
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import level, observation, shapes
+from swarmjax.task import level, observation, room
 from swarmjax.task import stage as task_stage
-from swarmjax.task.config import NeighboursConfig
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
@@ -73,8 +71,8 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m. None means the half edges that
-        stage and `shape` give.
+      half: [M, 2] half edges of the boxes in the coming levels, m. None means those of the
+        stage's first level.
 
     Returns:
       The judge.
@@ -89,12 +87,11 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
-    example = shapes.expand(example, config.shape)
+    if config.stage.kind is not None:
+        room.check_level(config.stage, example, spacing)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = task_electronics.load(
-        config.task, config.realism, trained.encoding, own, neighbours(trained)
-    )
+    electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)
     return Judge(
         config=config,
         policy=trained,
@@ -118,11 +115,6 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         substeps=substeps(config),
         own=_look_by(own),
     )
-
-
-def neighbours(trained: Policy) -> NeighboursConfig:
-    """Returns which neighbours a policy observes."""
-    return build(NeighboursConfig, trained.neighbours, "meta.observation.neighbours.")
 
 
 def substeps(config: EvaluateConfig) -> int:
@@ -203,7 +195,7 @@ def check_policy(
         extension.check_needs(needs, extensions, str(path), ["level"])
     layout = trained.meta["observation"]
     own = _observations(extensions, trained)
-    for key, expected in observation.describe(trained.encoding, own, neighbours(trained)).items():
+    for key, expected in observation.describe(trained.encoding, own).items():
         given = layout.get(key)
         if given != expected:
             raise PolicyError(

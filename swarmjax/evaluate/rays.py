@@ -1,7 +1,6 @@
 """The judge's infrared rays: MuJoCo's rays, cast on the real shapes. No JAX."""
 
 from dataclasses import dataclass
-from typing import cast
 
 import mujoco
 import numpy as np
@@ -39,7 +38,7 @@ def cast_rays(
     data: np.ndarray,
     pose: np.ndarray,
     obstacle: np.ndarray,
-    mount: infrared.Mount | None = None,
+    yaw: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Casts the infrared sensors' rays with MuJoCo.
 
@@ -53,14 +52,14 @@ def cast_rays(
       data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-      mount: Deviations of the sensors' positions and directions.
+      yaw: [A, R, K] by how much each sensor is turned from its nominal yaw, rad.
 
     Returns:
       [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
       of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
-    origin, direction = infrared.rays(pose, np, mount)
+    origin, direction = infrared.rays(pose, np, yaw)
     near = _near(scene, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
     arena, robot, _ = np.nonzero(near)
     origin, direction = origin[near], direction[near]
@@ -82,43 +81,6 @@ def cast_rays(
     return seen, geoms
 
 
-def hidden(
-    scene: RayScene, data: np.ndarray, pose: np.ndarray, obstacle: np.ndarray, reach: float
-) -> np.ndarray:
-    """Tells, with MuJoCo's rays, whether a wall or a box is between the centres of two robots.
-
-    Args:
-      scene: The scene.
-      data: [A] of `MjData`, positions up to date; each model's boxes have that arena's sizes.
-      pose: [A, R, 3] x (m), y (m), yaw (rad).
-      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
-      reach: Greatest distance at which two robots hear each other, m.
-
-    Returns:
-      [A, R, R] bool; False for pairs beyond reach.
-    """
-    place, half = pose[..., :2], np.linalg.norm(obstacle[..., 3:], axis=-1)
-    along = place[:, None] - place[:, :, None]
-    distance = np.linalg.norm(along, axis=-1)
-    middle = 0.5 * (place[:, None] + place[:, :, None])
-    # First compares a circle around the line with one around the box. Most pairs of robots then
-    # need no ray at all.
-    near = _apart(middle, obstacle[..., :2]) <= half[:, None, None] + 0.5 * distance[..., None]
-    asked = (distance <= reach) & np.triu(np.ones(distance.shape[1:], bool), 1)
-    blocked = np.zeros(distance.shape, bool)
-    for arena, i, j, box in zip(*np.nonzero(near & asked[..., None]), strict=True):
-        geom, where = scene.ids.obstacle_geom[box], cast("mujoco.MjData", data[arena])
-        start = np.array([*place[arena, i], epuck.SENSOR_HEIGHT])
-        toward = np.array([*along[arena, i, j], 0.0])  # as long as the line, so 1 is the line's end
-        frame = (where.geom_xpos[geom], where.geom_xmat[geom], where.model.geom_size[geom])
-        kind = where.model.geom_type[geom]
-        share = mujoco.mju_rayGeom(*frame, start, toward, kind)
-        # -1 means no hit. If a line starts inside a box, the result is the place where it leaves
-        # the box.
-        blocked[arena, i, j] |= 0.0 <= share < 1.0
-    return blocked | blocked.swapaxes(1, 2)
-
-
 def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
     """Returns the brightness of the geoms that rays meet.
 
@@ -132,10 +94,9 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
     """
     model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
     obstacles = scene.ids.obstacle_geom
-    if shades.wall is not None:
-        table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.wall[:, None]
-    if shades.obstacle is not None:
-        table[:, obstacles] = shades.obstacle
+    if shades.fixture is not None:
+        table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.fixture[:, :1]
+        table[:, obstacles] = shades.fixture[:, 1:]
     if shades.robot is not None:
         hulls = [model.geom(f"robot{i}_body").id for i in range(len(scene.ids.hull_body))]
         table[:, hulls] = shades.robot

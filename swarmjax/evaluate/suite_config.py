@@ -11,7 +11,6 @@ from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
 from swarmjax.sim.config import MOST_HULL_FRICTION
 from swarmjax.task import stage_files
-from swarmjax.task.shapes import Shape
 from swarmjax.task.stage_config import StageConfig, complete
 
 # Seeds of a suite's levels begin here. People and benchmarks choose small seeds, so they draw other
@@ -39,7 +38,6 @@ class CellConfig(Section):
     hull_friction: float | None = setting(
         None, "of the robots; null: the command's", 0.0, MOST_HULL_FRICTION
     )
-    shape: Shape = setting("box", "of the obstacles")
     digest: str | None = setting(None, "SHA-256 of the levels; null: not checked")
 
     def _check(self) -> None:

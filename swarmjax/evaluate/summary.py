@@ -93,7 +93,6 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
     return {
         "cell": cell.name,
         "stage": to_dict(cell.stage),
-        "shape": cell.shape,
         "realism": to_dict(mine.realism),
         "hull_friction": mine.robot.hull_friction,
         "episodes": len(cell.episodes),

@@ -5,7 +5,6 @@ the command line sets them. The judge's body does not come from the file. By def
 wheels.
 """
 
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
@@ -24,8 +23,6 @@ from swarmjax.task.config import TaskConfig, describe
 _TASK = ("control_step", "target_radius", "arrival", "observations")
 BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
 _SHOWN = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
-# Each policy has its own values of these keys, because they determine its network's inputs.
-_OWN = tuple(f"task.neighbours.{key}" for key in ("count", "range"))
 
 
 class Trained(NamedTuple):
@@ -59,8 +56,6 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     robot["max_speed"], robot["max_turn_rate"] = meta["action"]["high"][:2]
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
     task["sensor_range"] = meta["sensors"]["range"]
-    if "neighbours" in meta["observation"]:
-        task["neighbours"] = meta["observation"]["neighbours"]
     return Trained(
         robot=build(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),
@@ -104,7 +99,6 @@ def load[C: Section](
     if stage is None and trainings and trainings[0].stages:
         stage = trainings[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
-    _check_own(settings, dict(zip(metas, trainings, strict=True)))
     return settings, _say(settings, typed)
 
 
@@ -140,26 +134,10 @@ def _check_alike(
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):
             key = word.partition("=")[0]
-            if key not in given and key not in _OWN:
+            if key not in given:
                 raise ConfigError(
                     f"{paths[0]} and {path} were trained with different values of {key}: choose "
                     f"the one to judge them with, as in {word}."
-                )
-
-
-def _check_own(settings: Any, trainings: Mapping[str, Trained]) -> None:
-    """Refuses settings with another hearing than the first policy's.
-
-    Each policy is judged with its own hearing, since its network accepts no other.
-    """
-    for path, each in list(trainings.items())[:1]:
-        for key in _OWN:
-            read = operator.attrgetter(key.removeprefix("task."))
-            given, held = read(settings.task), read(each.task)
-            if given != held:
-                raise ConfigError(
-                    f"{key} is {given}, but {path} was trained with {held}: leave {key} out, since "
-                    "each policy is judged with the value that it was trained with."
                 )
 
 

@@ -107,7 +107,7 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage, shape and seed. A cell with values for realism or hull
+      cell: Cell that sets the stage and seed. A cell with values for realism or hull
         friction sets these too. A cell with a step limit sets it if `config` has none.
 
     Returns:
@@ -124,7 +124,6 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
         robot=robot,
         suite=None,
         stage=cell.stage,
-        shape=cell.shape,
         realism=realism,
         steps=(cell.steps or STEPS) if config.steps is None else config.steps,
         seed=cell.seed,

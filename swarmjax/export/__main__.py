@@ -136,11 +136,6 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
             f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
             "extension that only npz supports: give format=npz, or train with algo.network=mlp."
         )
-    if "neighbours" in meta["observation"]:
-        raise PolicyError(
-            f"format is {form}, but the policy observes neighbours, which only npz supports: give "
-            "format=npz, or train with task.neighbours.count=0."
-        )
     if form != "webots":
         return
     known = webots_controller.QUANTITIES

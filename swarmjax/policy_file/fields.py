@@ -18,7 +18,6 @@ _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
 _SMALLEST = float(np.finfo(np.float32).tiny)
 _MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
-_NEIGHBOUR_SIZE = 4  # entries of a neighbour: whether there is one, distance, cosine, sine
 _OWN_ARRAY = re.compile(NETWORK + r"(\w{1,64}/){0,8}\w{1,64}", re.ASCII)
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
@@ -139,9 +138,9 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
         "memory.size": _whole(1, 1024),
     },
     "observation.neighbours": {
-        "observation.neighbours": _OBJECT,
-        "observation.neighbours.count": _whole(1, 32),
-        "observation.neighbours.range": _POSITIVE,
+        "observation.neighbours": _Rule(
+            "none, since 8820a9f is the last commit that reads such a policy", lambda _: False
+        ),
     },
 }
 _MISSING = object()
@@ -278,9 +277,6 @@ def _shapes(
         return width
 
     depth = _hidden_layers(arrays, meta)
-    if "neighbours" in meta["observation"]:
-        neighbours = meta["observation"]["neighbours"]["count"]
-        width += add("hearing", _NEIGHBOUR_SIZE) - neighbours * _NEIGHBOUR_SIZE
     if "network" in meta:  # its layers come first, and only they know how many features they give
         own = {name: array for name, array in arrays.items() if _OWN_ARRAY.fullmatch(name)}
         shapes |= {name: (learners, *array.shape[1:]) for name, array in own.items()}

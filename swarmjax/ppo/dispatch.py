@@ -69,8 +69,7 @@ def find(backend: Backend) -> Learn:
 def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
     """Tells whether kernels may compute the update."""
     plain = config.critic == "observation" and networks.actor.torso is None
-    # The kernels support no layer in front of the hidden ones.
-    if not plain or sizes.hearing is not None or not _runs_kernels():
+    if not plain or not _runs_kernels():
         return False
     from swarmjax.ppo.fast import fused
 

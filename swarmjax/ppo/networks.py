@@ -40,22 +40,6 @@ MIN_STD = 1e-3
 OBSERVATION_LIMIT = 10.0
 
 
-class Hearing(NamedTuple):
-    """The place of neighbours in an observation: `rows` of `width` entries each, from `first` on.
-
-    The first entry of a row is 1 if there is a neighbour, otherwise 0.
-    """
-
-    first: int
-    rows: int
-    width: int
-
-    @property
-    def last(self) -> int:
-        """Index of the entry after the neighbours."""
-        return self.first + self.rows * self.width
-
-
 class Sizes(NamedTuple):
     """What a policy sees and does.
 
@@ -63,13 +47,11 @@ class Sizes(NamedTuple):
       observation: O, numbers of an observation.
       action: U, numbers of an action.
       state: P, numbers that the critic sees in addition.
-      hearing: place of the neighbours in an observation; None if robots do not hear.
     """
 
     observation: int
     action: int
     state: int = 0
-    hearing: Hearing | None = None
 
 
 @struct.dataclass(kw_only=True)
@@ -238,7 +220,7 @@ class _Network(nn.Module):
     ) -> tuple[tuple[jax.Array, ...], Any]:
         """Returns the features for the heads, and the memory after."""
         make = self.torso or functools.partial(_Torso, self.config)
-        features = make(name="torso")(_hear(self.config, self.sizes.hearing, seen))
+        features = make(name="torso")(seen)
         if self.config.memory == "none":
             return (features,), ()
         recalled, memory = Gru(
@@ -302,33 +284,6 @@ class _Critic(_Network):
         seen = jnp.concatenate([observation, *jax.tree.leaves(state)], axis=-1)
         features, memory = self._features(seen, memory, begins)
         return _Head(self.config, 1, name="value")(*features)[..., 0], memory
-
-
-def _hear(config: AlgoConfig, hearing: Hearing | None, seen: jax.Array) -> jax.Array:
-    """Sums neighbours up: applies one layer (`hearing`) to each neighbour and adds the results.
-
-    This is the form of a function of a set: Zaheer et al. 2017, "Deep Sets", theorem 2. The order
-    and the number of robots therefore do not matter.
-
-    Args:
-      config: settings of the layer.
-      hearing: place of the neighbours.
-      seen: [B, O], or [B, O + P] for a critic that sees the state too.
-
-    Returns:
-      [B, O - K W + E], or [B, O - K W + E + P] for a critic that sees the state too. E is the width
-      of the first hidden layer. Without neighbours, `seen` unchanged.
-    """
-    if hearing is None:
-        return seen
-    rows = seen[..., hearing.first : hearing.last]
-    rows = rows.reshape(*seen.shape[:-1], hearing.rows, hearing.width)
-    kernel, bias = _initializers(config, hearing.width, _HIDDEN_GAIN)
-    width = config.hidden_sizes[0]
-    layer = nn.Dense(width, kernel_init=kernel, bias_init=bias, name="hearing")
-    each = _ACTIVATIONS[config.activation](layer(rows)) * rows[..., :1]
-    parts = [seen[..., : hearing.first], jnp.sum(each, axis=-2), seen[..., hearing.last :]]
-    return jnp.concatenate(parts, axis=-1)
 
 
 def _initializers(config: AlgoConfig, inputs: int, gain: float) -> tuple[Any, Any]:

@@ -202,7 +202,6 @@ class PPO:
         moments = learner.normalizer
         if config.normalize_observations:
             moments = moments.update(batch.observation, batch.valid, shards)
-            moments = _leave_neighbours(moments, self.sizes)
         return replace(
             learner, params=params, optimizer_state=optimizer_state, normalizer=moments
         ), metrics
@@ -260,18 +259,6 @@ def _with_log_std(learner: LearnerState, log_std: jax.Array | float) -> LearnerS
     actor = learner.params["actor"]
     actor = actor | {"log_std": jnp.full_like(actor["log_std"], log_std)}
     return replace(learner, params=learner.params | {"actor": actor})
-
-
-def _leave_neighbours(moments: Normalizer, sizes: Sizes) -> Normalizer:
-    """Leaves neighbours' entries unnormalised: they are scaled, and their order must not matter."""
-    if sizes.hearing is None:
-        return moments
-    heard = slice(sizes.hearing.first, sizes.hearing.last)
-    return replace(
-        moments,
-        mean=moments.mean.at[heard].set(0.0),
-        variance=moments.variance.at[heard].set(1.0),
-    )
 
 
 def _is_finite(batch: Batch) -> jax.Array:

@@ -15,7 +15,7 @@ from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
-from swarmjax.task import arrival, electronics, reward
+from swarmjax.task import arrival, reward
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 
@@ -121,7 +121,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     """
     earning = weights(judge.policy, judge.config.task)
     arenas = engine_c.start(judge, levels)
-    mount = electronics.mount(arenas.factors)
+    yaw = arenas.factors.infrared_yaw
     frames = [_look(judge, arenas)]
     over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
     memory = policy.begin(judge.policy, arenas.pose.shape[:2])
@@ -132,7 +132,13 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
         over |= arenas.outcome.arrived.all(axis=-1)
     every = Frames(**{name: np.stack([each[name] for each in frames]) for name in frames[0]})
     return [
-        _cut(every.take(np.s_[:, i]), level, _scene(level, mount, i), judge, earning)
+        _cut(
+            every.take(np.s_[:, i]),
+            level,
+            _scene(level, None if yaw is None else yaw[i]),
+            judge,
+            earning,
+        )
         for i, level in enumerate(levels)
     ]
 
@@ -212,12 +218,10 @@ def _since(arrived: np.ndarray) -> np.ndarray:
     return np.where(arrived[-1], away + 1, 0)
 
 
-def _scene(level: Level, mount: infrared.Mount | None, i: int) -> ReplayScene:
-    """Records the fixed parts of arena i and the mounting of its sensors."""
-    if mount is not None:
-        mount = infrared.Mount(*(None if part is None else part[i] for part in mount))
+def _scene(level: Level, yaw: np.ndarray | None) -> ReplayScene:
+    """Records the fixed parts of an arena, whose sensors are turned by `yaw` [R, K], rad."""
     at_origin = np.zeros((len(level.target), 3))
-    origin, toward = infrared.rays(at_origin, np, mount)
+    origin, toward = infrared.rays(at_origin, np, yaw)
     return ReplayScene(
         side=float(level.side),
         target=level.target.astype(float),

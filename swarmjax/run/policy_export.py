@@ -63,8 +63,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     robot = trained.robot
     encoding = resolve_encoding(trained.task, trained.realism)
     chosen = pieces.choose(extension.load(trained.extensions), trained.task, trained.stage)
-    heard = trained.task.neighbours
-    described = observation.describe(encoding, chosen.observations, heard)
+    described = observation.describe(encoding, chosen.observations)
     algo = trained.algo
     optional: dict[str, Any] = {"network": algo.network} if _has_own_network(algo) else {}
     if algo.memory != "none":

@@ -72,7 +72,6 @@ class TrainConfig(ProgramConfig):
         self._check_devices()
         self._check_budget()
         self._check_counts()
-        self._check_hearing()
         check_realism(self.realism, self.robot, self.task, self.task.step_limit)
         if self.arena_devices > 1:
             object.__setattr__(self, "streams", self.stream_count)
@@ -131,15 +130,6 @@ class TrainConfig(ProgramConfig):
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, which is enough "
                 f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: "
                 f"give at most {most}."
-            )
-
-    def _check_hearing(self) -> None:
-        """Refuses options that a network that observes neighbours does not support."""
-        count = self.task.neighbours.count
-        if count and self.algo.network not in (None, "mlp"):
-            raise ConfigError(
-                f"algo.network is {self.algo.network}, but task.neighbours.count is {count}, which "
-                "works only with hidden layers: give algo.network=mlp or task.neighbours.count=0."
             )
 
     def _check_budget(self) -> None:

@@ -121,6 +121,5 @@ def _networks(settings: TrainConfig) -> dict[str, str]:
     found = {f"algo.{key}": getattr(algo, key) for key in NETWORK_KEYS if key != "network"}
     if algo.policy == "independent":
         found["sim.max_robots"] = settings.sim.max_robots
-    found["task.neighbours.count"] = settings.task.neighbours.count
     found["task.encoding"] = resolve_encoding(settings.task, settings.realism)
     return {key: show(value, quote="") for key, value in found.items()}

@@ -85,23 +85,15 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
     Raises:
       ConfigError: `swarm` is selected but not available for this combination.
     """
-    reasons = [
-        (impl != "warp", f"sim.impl is {impl}: give mjx or auto, or sim.impl=warp."),
-        (
-            robots > MOST_WHEELED,
-            f"sim.max_robots is {robots}: give mjx or auto, or {MOST_WHEELED} robots at most.",
-        ),
-        (
-            rubs,
-            "its hulls have friction (robot.hull_friction): give mjx or auto, or leave it out.",
-        ),
-    ]
-    missing = [reason for holds, reason in reasons if holds and body == "wheeled"]
-    if solver == "swarm" and missing:
-        raise ConfigError(f"sim.solver is swarm, but robot.body is wheeled and {missing[0]}")
+    available = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED and not rubs)
+    if solver == "swarm" and not available:
+        raise ConfigError(
+            f"sim.solver is swarm, but robot.body is {body}: give mjx or auto, or sim.impl=warp, "
+            f"at most {MOST_WHEELED} robots and no robot.hull_friction."
+        )
     if solver != "auto":
         return solver
-    return "mjx" if missing else "swarm"
+    return "swarm" if available else "mjx"
 
 
 class EngineChoice(NamedTuple):

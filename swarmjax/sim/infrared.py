@@ -18,29 +18,15 @@ Array = Any
 SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)
 
 
-class Mount(NamedTuple):
-    """Mounting errors of the sensors; None without errors.
-
-    Attributes:
-      yaw: [..., R, K] rad, counter-clockwise.
-      position: [..., R, K, 2] forward and left in the robot's frame, m.
-    """
-
-    yaw: Array | None = None
-    position: Array | None = None
-
-
 class Reflectance(NamedTuple):
     """Reflectances of surfaces, above 0 and at most 1; None means 1.
 
     Attributes:
-      wall: [...] reflectance of all walls.
-      obstacle: [..., M].
+      fixture: [..., 1 + M] of all walls, and of each obstacle.
       robot: [..., R].
     """
 
-    wall: Array | None = None
-    obstacle: Array | None = None
+    fixture: Array | None = None
     robot: Array | None = None
 
 
@@ -84,31 +70,29 @@ class Box(NamedTuple):
         return Box(*(part[index] for part in self))
 
 
-def rays(pose: Array, xp: Any, mount: Mount | None = None) -> tuple[Array, Array]:
+def rays(pose: Array, xp: Any, yaw: Array | None = None) -> tuple[Array, Array]:
     """Places the rays of robots in the world.
 
     Args:
       pose: [..., 3] x (m), y (m), yaw (rad).
       xp: `numpy` or `jax.numpy`.
-      mount: mounting errors of the sensors; None without errors.
+      yaw: [..., K] by how much each sensor is turned to the left of its nominal yaw, rad; None: 0.
 
     Returns:
       Origins and unit directions, [..., K, 2] each, world frame.
     """
-    x, y, toward_x, toward_y = _cast(pose, xp, mount)
+    x, y, toward_x, toward_y = _cast(pose, xp, yaw)
     return xp.stack([x, y], axis=-1), xp.stack([toward_x, toward_y], axis=-1)
 
 
-def _cast(pose: Array, xp: Any, mount: Mount | None) -> Ray:
+def _cast(pose: Array, xp: Any, yaw: Array | None) -> Ray:
     """Places the rays [..., K] of robots [..., 3] in the world."""
     cos, sin = xp.cos(pose[..., 2])[..., None], xp.sin(pose[..., 2])[..., None]
     x, y, bearing = SENSOR_POSES.T
     # Angle-sum identities avoid a sine and a cosine per ray for sensors with the nominal yaw.
     ahead, aside = np.cos(bearing), np.sin(bearing)
-    if mount is not None and mount.yaw is not None:
-        ahead, aside = xp.cos(bearing + mount.yaw), xp.sin(bearing + mount.yaw)
-    if mount is not None and mount.position is not None:
-        x, y = x + mount.position[..., 0], y + mount.position[..., 1]
+    if yaw is not None:
+        ahead, aside = xp.cos(bearing + yaw), xp.sin(bearing + yaw)
     return Ray(
         x=pose[..., :1] + cos * x - sin * y,
         y=pose[..., 1:2] + sin * x + cos * y,
@@ -208,7 +192,7 @@ def distances(
     hull_radius: float,
     limit: float,
     xp: Any,
-    mount: Mount | None = None,
+    yaw: Array | None = None,
 ) -> Array:
     """Returns the exact distances that the infrared sensors of a swarm see.
 
@@ -220,12 +204,12 @@ def distances(
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
       xp: `numpy` or `jax.numpy`.
-      mount: mounting errors of the sensors; None without errors.
+      yaw: [..., R, K] as in `rays`.
 
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
     """
-    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, mount, xp))
+    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, yaw, xp))
     return xp.maximum(least(reaches, limit, xp), 0.0)
 
 
@@ -236,7 +220,7 @@ def sights(
     hull_radius: float,
     limit: float,
     reflectance: Reflectance,
-    mount: Mount | None,
+    yaw: Array | None,
     xp: Any,
 ) -> tuple[Array, Array]:
     """Returns what the infrared sensors of a swarm see: distances and reflectances.
@@ -248,7 +232,7 @@ def sights(
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
       reflectance: reflectances of surfaces.
-      mount: mounting errors of the sensors; None without errors.
+      yaw: [..., R, K] as in `rays`.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -257,9 +241,10 @@ def sights(
       takes precedence over a robot, and a robot over an obstacle. Among objects of one kind, the
       brightest takes precedence.
     """
-    wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
-    walls = None if reflectance.wall is None else reflectance.wall[..., None]
-    things = ((wall, walls), (robot, reflectance.robot), (box, reflectance.obstacle))
+    wall, robot, box = _reaches(pose, side, obstacle, hull_radius, yaw, xp)
+    shades = reflectance.fixture
+    walls, boxes = (None, None) if shades is None else (shades[..., :1], shades[..., 1:])
+    things = ((wall, walls), (robot, reflectance.robot), (box, boxes))
     nearest, bright = xp.inf, 1.0
     for reaches, shade in things:
         here = least(reaches, xp.inf, xp)
@@ -281,10 +266,10 @@ def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) 
 
 
 def _reaches(
-    pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount | None, xp: Any
+    pose: Array, side: Array, obstacle: Array, hull_radius: float, yaw: Array | None, xp: Any
 ) -> tuple[list[Array], list[Array], list[Array]]:
     """Returns distances (m) to walls, other robots and obstacles, as pieces [..., R, K, N]."""
-    ray = _cast(pose, xp, mount)
+    ray = _cast(pose, xp, yaw)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
     ray = Ray(*(part[..., None] for part in ray))
     box, myself = turned(obstacle, xp), np.eye(pose.shape[-2], dtype=bool)

@@ -1,10 +1,10 @@
-"""Realistic motors: commands arrive late or get lost, and wheels follow them inexactly.
+"""Realistic motors: wheels follow commands inexactly.
 
 The code takes the array module as an argument, since training and JAX-free evaluation share it.
 """
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
@@ -20,99 +20,6 @@ _STEPS_PER_RADIAN = STEPS_PER_TURN / (2.0 * math.pi)
 # 0.1 ms, `e_motors.c` of e-puck-library. e-puck 2: ticks of 0.01 ms, two for each step, `motors.c`
 # of e-puck2_main-processor.
 _TICKS = {"epuck1": 10_000, "epuck2": 50_000}
-
-
-class Motor(NamedTuple):
-    """Commands on their way to the wheels; fields that no factor uses are None.
-
-    Attributes:
-      queue: [..., D, R, 2] the last commands sent, newest first; D is the largest latency.
-      held: [..., R] remaining control steps of a stall, int32.
-      applied: [..., R, 2] the command that the wheels followed last.
-    """
-
-    queue: Array | None
-    held: Array | None
-    applied: Array | None
-
-
-def init(realism: RealismConfig, robots: int, xp: Any) -> Motor | None:
-    """Starts an episode: all previous commands are zero, and the robots are at rest.
-
-    Args:
-      realism: determines which fields are used.
-      robots: R.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      The state of one arena; None if commands always arrive at once.
-    """
-    depth = 0 if realism.action_latency is None else realism.action_latency[1]
-    stalls = realism.stall is not None
-    if not depth and not stalls:
-        return None
-    return Motor(
-        queue=xp.zeros((depth, robots, 2), xp.float32) if depth else None,
-        held=xp.zeros(robots, xp.int32) if stalls else None,
-        applied=xp.zeros((robots, 2), xp.float32) if stalls else None,
-    )
-
-
-def deliver(
-    motor: Motor | None,
-    command: Array,
-    latency: Array | None,
-    realism: RealismConfig,
-    seed: Array,
-    clock: Array,
-    control_step: float,
-    xp: Any,
-) -> tuple[Motor | None, Array]:
-    """Sends a command, and returns the one that reaches the wheels in this control step.
-
-    A late command arrives a whole number of control steps later. While the link stalls, the wheels
-    keep the last command that arrived, as stepper motors do. After the stall they follow the newest
-    command that is due; older ones are lost. On a real robot, the header of a packet took 9.3 ms on
-    average and at most 1.95 s (620 packets over WiFi, log of UNIFR_API_EPUCK).
-
-    Args:
-      motor: state of the last control step, with the leading axes of `command`.
-      command: [..., R, 2] the command sent now, in any unit.
-      latency: [..., R] control steps, 0 to the largest latency of `realism`, int32; None means 0.
-      realism: provides probability and length of stalls; fixed for a program.
-      seed: [...] uint32 of the episode.
-      clock: [...] or [] control steps since the start.
-      control_step: s.
-      xp: `numpy` or `jax.numpy`.
-
-    Returns:
-      The new state, and the command [..., R, 2] that the wheels follow now.
-    """
-    if motor is None:
-        return None, command
-    queue, held, applied = motor
-    if queue is not None and latency is not None:
-        sent = xp.concatenate([command[..., None, :, :], queue], axis=-3)
-        command = xp.take_along_axis(sent, latency[..., None, :, None], axis=-3)[..., 0, :, :]
-        queue = sent[..., :-1, :, :]
-    if held is not None and applied is not None:
-        held = _stall(held, realism, seed, clock, control_step, xp)
-        command = xp.where(held[..., None] > 0, applied, command)
-        held, applied = xp.maximum(held - 1, 0), command
-    return Motor(queue, held, applied), command
-
-
-def _stall(
-    held: Array, realism: RealismConfig, seed: Array, clock: Array, control_step: float, xp: Any
-) -> Array:
-    """Starts stalls; returns the number [..., R] of stalled steps left, including this one."""
-    robots = held.shape[-1:]
-    begins = noise.uniform(seed, clock, Stream.STALL, robots, xp) < realism.stall
-    # Convert to control steps first, so that a fixed length rounds the same in NumPy and JAX.
-    low, high = (seconds / control_step for seconds in realism.stall_time)
-    share = noise.uniform(seed, clock, Stream.STALL_TIME, robots, xp)
-    length = xp.round(low + share * (high - low)).astype(xp.int32)
-    return xp.where((held == 0) & begins, length, held)
 
 
 def disturb(wheels: Array, realism: RealismConfig, seed: Array, clock: Array, xp: Any) -> Array:

@@ -12,8 +12,6 @@ import numpy as np
 
 Array = Any
 
-MOST = math.sqrt(48.0 * math.log(2.0))  # 5.77; largest magnitude of `normal`
-
 
 class Stream(enum.IntEnum):
     """Purpose of a random number; values must never change, so that old levels still replay.
@@ -23,20 +21,16 @@ class Stream(enum.IntEnum):
     """
 
     WHEEL_RADIUS = 0
-    WHEEL_MISMATCH = 1
     TRACK = 2
     MAX_WHEEL_SPEED = 3
     MASS = 4
     FRICTION = 5
     INFRARED_NOISE = 6
     INFRARED_GAIN = 7
-    INFRARED_OFFSET = 8
     INFRARED_YAW = 9
-    INFRARED_POSITION = 10
     INFRARED_PERIOD = 11
     DEAD_SENSOR = 12
-    REFLECTANCE_WALL = 13
-    REFLECTANCE_OBSTACLE = 14
+    REFLECTANCE = 14
     REFLECTANCE_ROBOT = 15
     ACTION_LATENCY = 16
     OBSERVATION_LATENCY = 17
@@ -44,14 +38,9 @@ class Stream(enum.IntEnum):
     LAYOUT = 19
     INFRARED = 32
     SPEED_NOISE = 33
-    STALL = 34
-    STALL_TIME = 35
     TARGET_DISTANCE = 36
     TARGET_BEARING = 37
     ACTION = 38
-    PACKET = 39
-    RANGE = 40
-    BEARING = 41
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
@@ -104,7 +93,7 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
 
     Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of Mathematical
     Statistics 29 (1958), pages 610-611, equation 1. The logarithm's argument is at least 2**-24, so
-    no result exceeds `MOST` in magnitude.
+    no result exceeds 5.77 in magnitude.
 
     Args:
       seed: [...] uint32.

@@ -18,14 +18,7 @@ _LONGEST = 3600.0  # s; a training episode takes 16 s, and no pause in it may be
 _MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
 _LATENCY_REASON = "every arena stores one command or observation for each control step of latency"
 # Factors on counts, which have no meaning for sensors that report metres.
-COUNTED = (
-    "infrared_noise",
-    "infrared_gain",
-    "infrared_offset",
-    "reflectance_wall",
-    "reflectance_obstacle",
-    "reflectance_robot",
-)
+COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,14 +42,8 @@ class RealismConfig(Section):
     infrared_gain: tuple[float, float] | None = setting(
         None, "factor on reflected counts; per sensor and episode", above=0.0, high=10.0
     )
-    infrared_offset: float | None = setting(
-        None, "SD of counts left after zeroing; per sensor and episode", 0.0, 4095.0
-    )
     infrared_yaw: float | None = setting(
         None, "SD of the yaw, rad; per sensor and episode", 0.0, math.pi
-    )
-    infrared_position: float | None = setting(
-        None, "SD of the position on each axis, m; per sensor and episode", 0.0, 0.01
     )
     infrared_period: tuple[float, float] | None = setting(
         None,
@@ -64,11 +51,11 @@ class RealismConfig(Section):
         above=0.0,
         high=_LONGEST,
     )
-    reflectance_wall: tuple[float, float] | None = setting(
-        None, "reflectance of all walls; per episode; null: 1", above=0.0, high=1.0
-    )
-    reflectance_obstacle: tuple[float, float] | None = setting(
-        None, "reflectance of each obstacle; per episode; null: 1", above=0.0, high=1.0
+    reflectance: tuple[float, float] | None = setting(
+        None,
+        "reflectance of each obstacle, and of all walls; per episode; null: 1",
+        above=0.0,
+        high=1.0,
     )
     reflectance_robot: tuple[float, float] | None = setting(
         None, "reflectance of each robot; per episode; null: 1", above=0.0, high=1.0
@@ -78,12 +65,6 @@ class RealismConfig(Section):
     )
     wheel_radius: tuple[float, float] | None = setting(
         None, "radius of the wheels, m; per robot and episode", LEAST, below=0.03
-    )
-    wheel_mismatch: float | None = setting(
-        None,
-        "SD of the relative difference in radius, right - left; per robot and episode",
-        0.0,
-        0.1,
     )
     track: tuple[float, float] | None = setting(
         None, "effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
@@ -114,12 +95,6 @@ class RealismConfig(Section):
         _MOST_LATENCY,
         reason=_LATENCY_REASON,
     )
-    stall: float | None = setting(
-        None, "probability that commands stop arriving; per control step", 0.0, 1.0
-    )
-    stall_time: tuple[float, float] = setting(
-        (0.1, 0.3), "duration, s; per stall", above=0.0, high=_LONGEST
-    )
     observation_latency: tuple[int, int] | None = setting(
         None,
         "latency of observations, control steps; per robot and episode",
@@ -132,15 +107,6 @@ class RealismConfig(Section):
     )
     target_bearing_noise: float | None = setting(
         None, "SD of the bearing, rad; per robot and control step", 0.0, math.pi
-    )
-    packet_loss: float | None = setting(
-        None, "probability that a robot misses a neighbour; per pair and control step", 0.0, 1.0
-    )
-    neighbour_distance_noise: float | None = setting(
-        None, "SD of the distance, m; per pair and control step", 0.0, 10.0
-    )
-    neighbour_bearing_noise: float | None = setting(
-        None, "SD of the bearing, rad; per pair and control step", 0.0, math.pi
     )
 
     def _check(self) -> None:

@@ -48,13 +48,11 @@ class Wear(NamedTuple):
     Attributes:
       noise: factor on the model's own noise; None for no noise at all.
       gain: factor on the reflected part of the reading.
-      offset: constant error of the reading, counts.
       dead: whether the sensor never detects anything, bool.
     """
 
     noise: Array | None = None
     gain: Array | None = None
-    offset: Array | None = None
     dead: Array | None = None
 
 
@@ -87,8 +85,6 @@ def read(
         counts, sd = _webots(ray, bright, gain, xp)
     else:
         counts, sd = _real(ray, bright, gain, xp)
-    if wear.offset is not None:
-        counts = counts + wear.offset
     if wear.noise is None or normal is None:
         return counts
     return counts + wear.noise * sd * normal

@@ -12,7 +12,6 @@ from swarmjax.task.arrival import Arrival
 
 # The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
-NEIGHBOUR_SIZE = 4  # observation entries of a neighbour: presence, distance, cosine, sine
 
 
 def _weight(default: float, meaning: str) -> Any:
@@ -44,24 +43,6 @@ class RewardConfig(Section):
 
 
 @dataclass(frozen=True, kw_only=True)
-class NeighboursConfig(Section):
-    """What a robot receives from other robots: range and bearing."""
-
-    count: int = setting(0, "nearest neighbours observed; 0: none", 0, 32)
-    range: float = field(
-        # AutoMoDe's reference models use a range-and-bearing board. We assume the range of that
-        # board.
-        default=0.7,
-        metadata=about("between centres, m", above=0.0, high=10.0),
-    )
-
-    @property
-    def size(self) -> int:
-        """Observation entries for all neighbours."""
-        return self.count * NEIGHBOUR_SIZE
-
-
-@dataclass(frozen=True, kw_only=True)
 class TaskConfig(Section):
     """What a robot is asked to do, and what it senses."""
 
@@ -87,7 +68,6 @@ class TaskConfig(Section):
     observations: tuple[str, ...] | None = setting(
         None, "observations of extensions, in order; null: all of them"
     )
-    neighbours: NeighboursConfig = field(default_factory=NeighboursConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
 
 
@@ -124,12 +104,10 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
                 f"realism.{key} is {show(value)}, but robot.hull_radius is {show(hull)} and the "
                 f"wheels lie inside the hull: give less than {show(most)}."
             )
-    stall_time = None if realism.stall is None else realism.stall_time
     for key, value, length, unit in (
         ("action_latency", realism.action_latency, steps, "control steps"),
         ("observation_latency", realism.observation_latency, steps, "control steps"),
         ("infrared_period", realism.infrared_period, seconds, "s"),
-        ("stall_time", stall_time, seconds, "s"),
     ):
         if value is not None and value[1] >= length:
             raise ConfigError(

@@ -15,18 +15,15 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, motor, noise, response
 from swarmjax.sim.body import Chassis
 from swarmjax.sim.drive import Drive
-from swarmjax.sim.motor import Motor
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task import hearing, observation
-from swarmjax.task.config import NeighboursConfig, TaskConfig, resolve_encoding
+from swarmjax.task import observation
+from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.factors import Factors
-from swarmjax.task.hearing import Heard
 from swarmjax.task.level import Level
 from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
-_DEAF = NeighboursConfig()
 _SLACK = 1e-4  # share of a period, so that rounding does not delay a sample that is due now
 
 
@@ -40,7 +37,6 @@ class Electronics:
       sensor_range: largest infrared distance that is observed, m.
       control_step: s.
       own: observations of an extension, placed after the built-in ones.
-      neighbours: which neighbours are observed.
     """
 
     realism: RealismConfig
@@ -48,12 +44,11 @@ class Electronics:
     sensor_range: float
     control_step: float
     own: tuple[Observation, ...] = ()
-    neighbours: NeighboursConfig = _DEAF
 
     @cached_property
     def layout(self) -> Layout:
         """Names, units and scales of the observation's entries."""
-        return observation.layout(self.encoding, self.own, self.neighbours)
+        return observation.layout(self.encoding, self.own)
 
     @property
     def reach(self) -> float:
@@ -61,23 +56,17 @@ class Electronics:
         curves = {self.realism.infrared, self.encoding}
         return max([self.sensor_range, *(response.REACH.get(name, 0.0) for name in curves)])
 
-    @property
-    def latency(self) -> int:
-        """Largest latency of an observation, control steps."""
-        bounds = self.realism.observation_latency
-        return 0 if bounds is None else bounds[1]
-
 
 class Memory(NamedTuple):
     """State that the electronics keep between control steps; an unused part is None.
 
     Attributes:
-      motor: delayed commands.
+      commands: [..., D, R, 2] delayed commands, newest first.
       infrared: [..., R, K] the last sample, before it is scaled.
       seen: [..., D, R, O] delayed observations, newest first.
     """
 
-    motor: Motor | None
+    commands: Array | None
     infrared: Array | None
     seen: Array | None
 
@@ -91,7 +80,6 @@ class Sight(NamedTuple):
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
-      heard: neighbours within reach; None if robots do not observe neighbours.
     """
 
     ray: Array
@@ -99,7 +87,6 @@ class Sight(NamedTuple):
     distance: Array
     bearing: Array
     own: Array | None = None
-    heard: Heard | None = None
 
 
 def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) -> View:
@@ -135,7 +122,6 @@ def load(
     realism: RealismConfig,
     encoding: Encoding | None = None,
     own: Sequence[Observation] = (),
-    neighbours: NeighboursConfig | None = None,
 ) -> Electronics:
     """Creates the electronics from the settings.
 
@@ -144,8 +130,6 @@ def load(
       realism: the factors.
       encoding: encoding that the policy was trained with; None for the encoding of the task.
       own: observations of an extension.
-      neighbours: neighbour settings that the policy was trained with; None for the settings of the
-        task.
 
     Returns:
       The electronics.
@@ -156,7 +140,6 @@ def load(
         sensor_range=task.sensor_range,
         control_step=task.control_step,
         own=tuple(own),
-        neighbours=task.neighbours if neighbours is None else neighbours,
     )
 
 
@@ -165,27 +148,16 @@ def chassis(factors: Factors) -> Chassis:
     return Chassis(factors.wheel_radius, factors.track, factors.mass, factors.friction)
 
 
-def mount(factors: Factors) -> infrared.Mount | None:
-    """Returns how the sensors are mounted in an episode; None for the nominal mounting."""
-    if factors.infrared_yaw is None and factors.infrared_position is None:
-        return None
-    return infrared.Mount(factors.infrared_yaw, factors.infrared_position)
-
-
 def reflectance(factors: Factors) -> infrared.Reflectance | None:
     """Returns the reflectances in an episode; None if all are 1."""
-    found = infrared.Reflectance(
-        factors.reflectance_wall, factors.reflectance_obstacle, factors.reflectance_robot
-    )
-    return None if all(part is None for part in found) else found
+    shades = infrared.Reflectance(factors.reflectance, factors.reflectance_robot)
+    return None if all(part is None for part in shades) else shades
 
 
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode with no command under way.
-
-    Delayed observations are filled with the first one.
+    """Starts an episode: all earlier commands are zero, and earlier observations the first one.
 
     Args:
       electronics: electronics of the program.
@@ -197,19 +169,32 @@ def begin(
     Returns:
       The memory, and the first observation [..., R, O].
     """
-    robots = sight.ray.shape[-2]
-    readings = _read(electronics, factors, sight, clock, xp)
+    readings, realism = _read(electronics, factors, sight, clock, xp), electronics.realism
     fresh = observation.observe(readings, electronics.layout, xp)
-    seen = None
-    if electronics.latency:
-        seen = xp.stack([fresh] * electronics.latency, axis=-3)
-    held = None if factors.infrared_period is None else readings.infrared
-    queue = motor.init(electronics.realism, robots, xp)
-    leading = sight.distance.shape[:-1]
-    if queue is not None:
-        parts = (p if p is None else xp.broadcast_to(p, (*leading, *p.shape)) for p in queue)
-        queue = Motor(*parts)
-    return Memory(queue, held, seen), fresh
+    still = xp.zeros((*sight.distance.shape, sim_drive.ACTION_SIZE), xp.float32)
+    memory = Memory(
+        commands=_fill(realism.action_latency, still, xp),
+        infrared=None if factors.infrared_period is None else readings.infrared,
+        seen=_fill(realism.observation_latency, fresh, xp),
+    )
+    return memory, fresh
+
+
+def _fill(latency: tuple[int, int] | None, first: Array, xp: Any) -> Array | None:
+    """Fills the queue of the largest latency with the first value; None without latency."""
+    depth = latency[1] if latency else 0
+    return xp.stack([first] * depth, axis=-3) if depth else None
+
+
+def _delay(
+    queue: Array | None, newest: Array, latency: Array | None, xp: Any
+) -> tuple[Array | None, Array]:
+    """Puts the newest values [..., R, n] into the queue; returns it, and the values due now."""
+    if queue is None or latency is None:
+        return queue, newest
+    values = xp.concatenate([newest[..., None, :, :], queue], axis=-3)
+    due = xp.take_along_axis(values, latency[..., None, :, None], axis=-3)[..., 0, :, :]
+    return values[..., :-1, :, :], due
 
 
 def drive(
@@ -235,22 +220,12 @@ def drive(
     Returns:
       The new memory, and the driven wheel speeds [..., R, 2] (rad/s).
     """
-    realism = electronics.realism
-    queue, command = motor.deliver(
-        memory.motor,
-        command,
-        factors.action_latency,
-        realism,
-        factors.seed,
-        clock,
-        electronics.control_step,
-        xp,
-    )
+    commands, command = _delay(memory.commands, command, factors.action_latency, xp)
     if factors.max_wheel_speed is not None:
         motors = motors._replace(max_wheel_speed=factors.max_wheel_speed[..., None])
     wheels = sim_drive.wheel_speeds(command, motors, xp)
-    wheels = motor.disturb(wheels, realism, factors.seed, clock, xp)
-    return memory._replace(motor=queue), wheels
+    wheels = motor.disturb(wheels, electronics.realism, factors.seed, clock, xp)
+    return memory._replace(commands=commands), wheels
 
 
 def sense(
@@ -280,12 +255,8 @@ def sense(
         last = xp.where(due[..., None], readings.infrared, memory.infrared)
         memory, readings = memory._replace(infrared=last), readings._replace(infrared=last)
     fresh = observation.observe(readings, electronics.layout, xp)
-    if memory.seen is None or factors.observation_latency is None:
-        return memory, fresh
-    seen = xp.concatenate([fresh[..., None, :, :], memory.seen], axis=-3)
-    late = factors.observation_latency[..., None, :, None]
-    found = xp.take_along_axis(seen, late, axis=-3)[..., 0, :, :]
-    return memory._replace(seen=seen[..., :-1, :, :]), found
+    seen, due = _delay(memory.seen, fresh, factors.observation_latency, xp)
+    return memory._replace(seen=seen), due
 
 
 def _read(
@@ -294,11 +265,7 @@ def _read(
     """Takes readings of all sensors."""
     sample = _read_infrared(electronics, factors, sight, clock, xp)
     distance, bearing = _find_target(electronics.realism, factors, sight, clock, xp)
-    heard = None
-    if sight.heard is not None:
-        told = (electronics.neighbours, electronics.realism, factors.seed)
-        heard = hearing.listen(sight.heard, *told, clock, xp)
-    return Readings(sample, distance, bearing, sight.own, heard)
+    return Readings(sample, distance, bearing, sight.own)
 
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
@@ -332,9 +299,7 @@ def _read_counts(
     kind: response.Response, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> Array:
     """Samples the counts of sensors with the response `kind`, [..., R, K]."""
-    wear = response.Wear(
-        factors.infrared_noise, factors.infrared_gain, factors.infrared_offset, factors.dead_sensor
-    )
+    wear = response.Wear(factors.infrared_noise, factors.infrared_gain, factors.dead_sensor)
     normal = None
     if factors.infrared_noise is not None:
         shape = sight.ray.shape[-2:]

@@ -25,7 +25,6 @@ from swarmjax.task import (
     arrival,
     extended,
     geodesic,
-    hearing,
     observation,
     pieces,
     reward,
@@ -211,7 +210,7 @@ def reset(world: World, level: Level) -> EnvState:
       The state, with `sim` as a `PhysicsState`.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
-    factors = task_factors.draw(level.seed, world.realism, world.robot, robots, obstacles, jnp)
+    factors = task_factors.draw(level.seed, world.realism, robots, obstacles, jnp)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
@@ -390,16 +389,16 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     """Computes the sensor quantities at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
-    mount, shades = task_electronics.mount(factors), task_electronics.reflectance(factors)
+    yaw, shades = factors.infrared_yaw, task_electronics.reflectance(factors)
     arena = (pose, level.side, level.obstacle, radius, reach)
     if shades is None:
-        ray, bright = infrared.distances(*arena, jnp, mount), None
+        ray, bright = infrared.distances(*arena, jnp, yaw), None
     else:
-        ray, bright = infrared.sights(*arena, shades, mount, jnp)
+        ray, bright = infrared.sights(*arena, shades, yaw, jnp)
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return _hear(world, Sight(ray, bright, distance, bearing), pose, level)
+    return Sight(ray, bright, distance, bearing)
 
 
 def _look_by_extension(
@@ -410,16 +409,6 @@ def _look_by_extension(
         return sight
     view = task_electronics.view(sight, pose, level, arrived, clock)
     return sight._replace(own=extended.look(world.electronics.own, view))
-
-
-def _hear(world: World, sight: Sight, pose: Array, level: Level) -> Sight:
-    """Adds neighbours in reach at poses [R, 3]."""
-    settings = world.electronics.neighbours
-    if not settings.count:
-        return sight
-    hidden = hearing.hidden(pose, level.obstacle, jnp)
-    found = hearing.reachable(pose, level.present, hidden, settings, jnp)
-    return sight._replace(heard=found)
 
 
 def _tally(

@@ -13,9 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.config import to_dict
 from swarmjax.extension import Observation
-from swarmjax.task.config import NeighboursConfig
 
 Array = Any
 Encoding = Literal["metric", "webots"]
@@ -30,14 +28,12 @@ class Readings(NamedTuple):
       distance: [...] distance to the target, m.
       bearing: [...] bearing of the target, rad.
       own: [..., E] observations of an extension; None without any.
-      heard: [..., K W] nearest neighbours; None if they are not observed.
     """
 
     infrared: Array
     distance: Array
     bearing: Array
     own: Array | None = None
-    heard: Array | None = None
 
 
 class Coding(NamedTuple):
@@ -106,36 +102,19 @@ class Layout(NamedTuple):
         return len(self.names)
 
 
-def layout(
-    encoding: Encoding,
-    own: Sequence[Observation] = (),
-    neighbours: NeighboursConfig | None = None,
-) -> Layout:
-    """Lays out an observation: built-in inputs, observations of an extension, then neighbours.
+def layout(encoding: Encoding, own: Sequence[Observation] = ()) -> Layout:
+    """Lays out an observation: built-in inputs, then observations of an extension.
 
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension, in order.
-      neighbours: neighbour settings; None if they are not observed.
 
     Returns:
       The layout.
     """
     rows = [(name, *each.codings[encoding]) for each in INPUTS for name in each.names]
     rows += [(name, each.unit, each.offset, each.scale) for each in own for name in each.names]
-    rows += [] if neighbours is None else _neighbour_rows(neighbours)
     return Layout(*zip(*rows, strict=True))
-
-
-def _neighbour_rows(neighbours: NeighboursConfig) -> list[tuple[str, str, float, float]]:
-    """Lists name, unit, offset and scale of all neighbour entries, the nearest neighbour first."""
-    one = [("", "1", 1.0), ("_distance", "m", neighbours.range)]
-    one += [(f"_bearing_{part}", "1", 1.0) for part in ("cos", "sin")]
-    return [
-        (f"neighbour_{i}{name}", unit, 0.0, scale)
-        for i in range(neighbours.count)
-        for name, unit, scale in one
-    ]
 
 
 LAYOUTS = {encoding: layout(encoding) for encoding in get_args(Encoding)}
@@ -143,25 +122,18 @@ NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size
 
 
-def describe(
-    encoding: Encoding,
-    own: Sequence[Observation] = (),
-    neighbours: NeighboursConfig | None = None,
-) -> dict[str, Any]:
+def describe(encoding: Encoding, own: Sequence[Observation] = ()) -> dict[str, Any]:
     """Describes the observation of a policy as plain data for its file.
 
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension.
-      neighbours: neighbour settings; None if they are not observed.
 
     Returns:
-      `names`, `encoding`, and the layout's `units`, `offset` and `scale`. If neighbours
-      are observed, the data also holds `neighbours`: `count` and `range` (m).
+      `names`, `encoding`, and the layout's `units`, `offset` and `scale`.
     """
-    found = {key: list(value) for key, value in layout(encoding, own, neighbours)._asdict().items()}
-    heard = {} if not neighbours or not neighbours.count else {"neighbours": to_dict(neighbours)}
-    return {"encoding": encoding, **found, **heard}
+    parts = layout(encoding, own)._asdict()
+    return {"encoding": encoding, **{key: list(values) for key, values in parts.items()}}
 
 
 def to_target(pose: Array, target: Array, xp: Any) -> tuple[Array, Array]:
@@ -194,7 +166,6 @@ def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
     """
     parts = [each.read(readings) for each in INPUTS]
     parts += [] if readings.own is None else [readings.own]
-    parts += [] if readings.heard is None else [readings.heard]
     entries = xp.concatenate(parts, axis=-1).astype(xp.float32)
     offset, scale = (np.array(x, np.float32) for x in (layout.offset, layout.scale))
     if not offset.any() and (scale == 1.0).all():

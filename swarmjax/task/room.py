@@ -4,15 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from swarmjax.config import ConfigError, show
+from swarmjax.config import ConfigError
 from swarmjax.extension import LevelDrawing
-from swarmjax.task import extended, level
+from swarmjax.sim import gaps
+from swarmjax.task import level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
 
 _TRIED = 16  # levels of a stage to check
-_BESIDE = 0.003  # m, between the hull and each side of the narrowest door
+_THINGS: dict[str, str] = dict(
+    zip(gaps.KINDS, ("another robot", "an obstacle", "a wall"), strict=True)
+)
 
 
 def check(
@@ -35,49 +38,49 @@ def check(
         own = next((piece for piece in drawings if piece.name == stage.level), None)
         if own is None and not stage.map and stage.kind is None:
             continue
-        _check_gap(stage, spacing)
         arrays = task_stage.single(stage, drawings)
         for each in uniforms:
             drawn = level.sample(each, arrays, spacing, np)
-            if own is not None:
-                drawn = extended.redraw(own, drawn)
-            problem = _problem(drawn, spacing, targets=own is None)
-            if problem and own is not None:
-                raise ConfigError(
-                    f"{extended.label(own)}, drawn for stage {stage.name}: {problem}."
-                )
-            if problem:
-                raise ConfigError(
-                    f"stage {stage.name}: level={stage.level} has no room for {stage.robots} "
-                    f"robots, since {problem}: give fewer robots, or more space."
-                )
+            if own is None:
+                check_level(stage, drawn, spacing)
+            else:
+                _check_own(own, stage, drawn, spacing)
 
 
-def _check_gap(stage: StageConfig, spacing: Spacing) -> None:
-    """Refuses doors and corridors that are narrower than a robot."""
-    least = 2.0 * (spacing.hull_radius + _BESIDE)
-    for key in ("gap", "width"):
-        found = stage.smallest(key)
-        if found is not None and found < least:
-            raise ConfigError(
-                f"stage {stage.name}: {key} is {show(found)}, but a robot is "
-                f"{show(2.0 * spacing.hull_radius)} m wide: give at least {show(round(least, 4))}."
-            )
+def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
+    """Refuses a level of a map or a layout that has no room for its robots; without JAX."""
+    arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
+    problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
+    if not problem and (arrived & drawn.present).any():
+        problem = "a robot starts within its target"
+    if problem:
+        raise ConfigError(
+            f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots, since "
+            f"{problem}: give fewer robots, or more space."
+        )
 
 
-def _problem(drawn: Level, spacing: Spacing, *, targets: bool) -> str | None:
-    """Describes the fault of a level, if it has one; an extension's targets may overlap."""
+def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
+    """Refuses a level of an extension, whose targets may overlap."""
+    from swarmjax.task import extended  # with JAX
+
+    problem = _problem(extended.redraw(own, drawn), spacing, ("robot", "wall"), ("wall",))
+    if problem:
+        raise ConfigError(f"{extended.label(own)}, drawn for stage {stage.name}: {problem}.")
+
+
+def _problem(
+    drawn: Level, spacing: Spacing, at_start: Sequence[str], at_target: Sequence[str]
+) -> str | None:
+    """Describes the fault of a level: what a robot touches at its start or its target."""
     start, target = drawn.start[drawn.present], drawn.target[drawn.present]
     if not all(np.isfinite(field).all() for field in (start, target, drawn.obstacle)):
         return "a number is not finite"
-    room = 0.5 * float(drawn.side) - spacing.hull_radius
-    for what, place in (("starts", start[:, :2]), ("has its target", target)):
-        outside = np.flatnonzero(np.abs(place).max(axis=-1) > room)
-        if outside.size:
-            return f"robot {outside[0]} {what} {show(room)} m or more off the middle of the arena"
-        apart = np.linalg.norm(place[:, None] - place[None, :], axis=-1)
-        close = np.argwhere(np.triu(apart < 2.0 * spacing.hull_radius, 1))
-        if close.size and (what == "starts" or targets):
-            return f"robots {close[0][0]} and {close[0][1]} overlap where each {what}"
-    arrived = np.linalg.norm(start[:, :2] - target, axis=-1) < spacing.target_radius
-    return "a robot starts within its target" if targets and arrived.any() else None
+    there = np.concatenate([target, start[:, 2:]], axis=-1)
+    for what, pose, kinds in (("starts", start, at_start), ("has its target", there, at_target)):
+        gap = gaps.gaps(pose, drawn.side, drawn.obstacle, spacing.hull_radius, np)
+        for kind in kinds:
+            touching = np.flatnonzero(gap[:, gaps.KINDS.index(kind)] < 0.0)
+            if touching.size:
+                return f"robot {touching[0]} overlaps {_THINGS[kind]} where it {what}"
+    return None

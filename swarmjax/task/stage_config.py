@@ -1,7 +1,6 @@
-"""Settings of a stage, the arena size that its levels need, and grids of stages."""
+"""Settings of a stage, and the arena size that its levels need."""
 
 import functools
-import itertools
 import math
 import re
 import typing
@@ -187,22 +186,6 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
-        numbers = {key: _ends(getattr(self, key))[1] for key in layout.reads}
-        sizes = {"side": self.sides[0], "breadth": _ends(self.breadth or self.side)[0]}
-        demand = {"robots": self.robots, **sizes, **numbers}
-        for (key, found), least in zip(sizes.items(), layout.least(demand), strict=True):
-            if found < least - 1e-9:
-                with_ = " ".join(f"{key}={show(getattr(self, key))}" for key in layout.reads)
-                raise ConfigError(
-                    f"{key} is {show(getattr(self, key) or self.side)}, too small for level="
-                    f"{self.level} with robots={self.robots} and {with_}: give at least "
-                    f"{math.ceil(100 * least - 1e-6) / 100}."
-                )
-
-    def smallest(self, key: str) -> float | None:
-        """Returns the smaller end of a layout's number, m; None if it is not set."""
-        given = getattr(self, key)
-        return None if given is None else _ends(given)[0]
 
     @property
     def kind(self) -> Kind | None:
@@ -252,8 +235,11 @@ def smallest_side(stage: StageConfig) -> float:
     Returns:
       The side, m.
     """
-    random = stage.level != "fixed"  # an extension's drawing starts from a random level
-    return _smallest_side(stage.robots, stage.obstacles, stage.obstacle_size, random=random)
+    pitch = stage.obstacle_size * math.sqrt(2) + PASSAGE
+    area = stage.robots * 2 * DISC**2 + stage.obstacles * pitch**2
+    if stage.level != "fixed":  # an extension's drawing starts from a random level
+        area = max(area, stage.obstacles * pitch**2 / FILLING)
+    return PASSAGE + math.sqrt(area)
 
 
 def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
@@ -276,16 +262,6 @@ def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
     )
 
 
-def _smallest_side(
-    robots: int, obstacles: int, obstacle_size: float, *, random: bool = True
-) -> float:
-    pitch = obstacle_size * math.sqrt(2) + PASSAGE
-    area = robots * 2 * DISC**2 + obstacles * pitch**2
-    if random:
-        area = max(area, obstacles * pitch**2 / FILLING)
-    return PASSAGE + math.sqrt(area)
-
-
 def _whole(length: float | tuple[float, float]) -> list[int]:
     """Rounds an extent to an even number of units, so that its half is a whole number of units."""
     return [2 * round(end * UNITS / 2) for end in _ends(length)]
@@ -293,48 +269,3 @@ def _whole(length: float | tuple[float, float]) -> list[int]:
 
 def _ends(side: float | tuple[float, float]) -> tuple[float, float]:
     return side if isinstance(side, tuple) else (side, side)
-
-
-@dataclass(frozen=True, kw_only=True)
-class GridConfig(Section):
-    """A grid of stages: all combinations of numbers of robots, numbers of obstacles and sides."""
-
-    robots: tuple[int, ...] = field(metadata=about("active robots", 1, 100))
-    obstacles: tuple[int, ...] = setting((0,), "obstacles", 0, _MOST_OBSTACLES)
-    side: tuple[float | tuple[float, float], ...] = field(
-        metadata=about("sides of the square arena, m; a range: each level draws a side", 0.4, 4.0)
-    )
-    obstacle_size: float = setting(0.10, "edge of the square boxes, m", 0.02, 0.3)
-
-    def _check(self) -> None:
-        if not self.stages():
-            raise ConfigError(
-                f"side is {show(self.side)}, which no cell of the grid fits with robots="
-                f"{show(self.robots)} and obstacles={show(self.obstacles)}: give at least one "
-                "number of each, and larger sides."
-            )
-
-    def stages(self) -> tuple[StageConfig, ...]:
-        """Creates the stages, with sides varying fastest and robots slowest.
-
-        Combinations that do not fit into their arena are left out.
-        """
-        size = self.obstacle_size
-        return tuple(
-            StageConfig(
-                name=_cell_name(robots, obstacles, side),
-                robots=robots,
-                obstacles=obstacles,
-                side=side,
-                obstacle_size=size,
-            )
-            for robots, obstacles, side in itertools.product(self.robots, self.obstacles, self.side)
-            if _ends(side)[0] >= _smallest_side(robots, obstacles, size)
-        )
-
-
-def _cell_name(robots: int, obstacles: int, side: float | tuple[float, float]) -> str:
-    """Names a cell of a grid by its numbers (lengths in cm), as in r5-o3-s120 or r5-o3-s50-120."""
-    ends = side if isinstance(side, tuple) else (side,)
-    lengths = "-".join(f"{100 * length:.6g}".replace(".", "_") for length in ends)
-    return f"r{robots}-o{obstacles}-s{lengths}"

@@ -1,18 +1,12 @@
-"""Finds the stages that a choice of configs/stage/ names: one stage, a sequence or a grid."""
+"""Finds the stages that a choice of configs/stage/ names: one stage or a sequence."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from swarmjax.config import ConfigError, Section, build, files, show, to_dict
+from swarmjax.config import ConfigError, Section, files, show
 from swarmjax.config.reading import called
-from swarmjax.task.stage_config import GridConfig, complete
-
-# The files that name several stages: their key, and what a message calls them and advises.
-_SEVERAL = {
-    "sequence": "a curriculum: choose one stage, as in stage=s6",
-    "grid": "a grid: give its axes, as in stage.grid.side=[0.7,1.0]",
-}
+from swarmjax.task.stage_config import complete
 
 
 def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
@@ -23,17 +17,16 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
       choice: the name of its file.
 
     Raises:
-      ConfigError: the file, its sequence or its grid is invalid, or the file does not take these
-        keys.
+      ConfigError: the file or its sequence is invalid, or the file does not take these keys.
     """
-    several = _several(choice)
-    if several is None:
+    if not _is_sequence(choice):
         return [_named(stage, choice)]
-    for key in stage.keys() - {several}:
-        raise ConfigError(f"stage.{key} cannot be given for {choice}, {_SEVERAL[several]}.")
-    if several == "sequence":
-        return _sequence(stage["sequence"], choice)
-    return [to_dict(cell) for cell in build(GridConfig, stage["grid"], "stage.grid.").stages()]
+    for key in stage.keys() - {"sequence"}:
+        raise ConfigError(
+            f"stage.{key} cannot be given for {choice}, a curriculum: choose one stage, as in "
+            "stage=s6."
+        )
+    return _sequence(stage["sequence"], choice)
 
 
 def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
@@ -46,9 +39,8 @@ def pick_one(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     Raises:
       ConfigError: the choice names several stages, or is invalid.
     """
-    if several := _several(choice):
-        what = _SEVERAL[several].partition(":")[0]
-        raise ConfigError(f"stage is {choice}, {what}: give one stage, as in stage=s6.")
+    if _is_sequence(choice):
+        raise ConfigError(f"stage is {choice}, a curriculum: give one stage, as in stage=s6.")
     return _named(stage, choice)
 
 
@@ -62,7 +54,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
     """
-    if _several(choice, key):
+    if _is_sequence(choice, key):
         raise ConfigError(f"{key} is {choice}, which names several stages: give single stages.")
     return _named(files.read_choice("stage", choice), choice)
 
@@ -99,17 +91,16 @@ def _check_suite_alone(cls: type[Section], suite: object, overrides: Sequence[st
     if suite is None:
         return
     for key in files.parse(cls, overrides):
-        if key.partition(".")[0] in ("stage", "shape", "episodes", "seed"):
+        if key.partition(".")[0] in ("stage", "episodes", "seed"):
             raise ConfigError(
                 f"{key} cannot be given with suite={called(str(suite))}, which sets its own "
                 f"levels: leave {key} or suite out."
             )
 
 
-def _several(choice: str, key: str = "stage") -> str | None:
-    """Returns the key of `_SEVERAL` that a file of configs/stage/ has, if it has one."""
-    stage = files.read_choice("stage", choice, key)
-    return next((several for several in _SEVERAL if several in stage), None)
+def _is_sequence(choice: str, key: str = "stage") -> bool:
+    """Returns whether a file of configs/stage/ names several stages."""
+    return "sequence" in files.read_choice("stage", choice, key)
 
 
 def _sequence(stages: Any, choice: str) -> list[dict[str, Any]]:

@@ -120,7 +120,7 @@ def _nearest(distance: Array, is_there: Array, count: int) -> tuple[Array, Array
       [R, n] indices of the chosen objects, and [R, n] whether they are present.
     """
     ranked = jnp.where(is_there, distance, jnp.inf)
-    chosen = nearest(ranked, min(count, distance.shape[1]), jnp)
+    chosen = nearest(ranked, min(count, distance.shape[1]))
     there = jnp.broadcast_to(is_there, distance.shape)
     return chosen, jnp.take_along_axis(there, chosen, axis=1)
 

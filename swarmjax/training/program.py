@@ -7,14 +7,13 @@ import numpy as np
 
 from swarmjax import extension
 from swarmjax.curriculum.engine import NEVER, Schedule
-from swarmjax.ppo.networks import Hearing, Sizes
+from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
 from swarmjax.task import env, surroundings
 from swarmjax.task import stage as task_stage
-from swarmjax.task.config import NEIGHBOUR_SIZE
 from swarmjax.task.env import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
@@ -67,13 +66,10 @@ def load_ppo(config: ProgramConfig, world: World) -> PPO:
     Raises:
       ConfigError: the network of an extension or the gradient's backend does not fit.
     """
-    size, heard = world.observation_size, config.task.neighbours
-    first = size - heard.size
     sizes = Sizes(
-        observation=size,
+        observation=world.observation_size,
         action=drive.ACTION_SIZE,
         state=surroundings.SIZE if config.algo.critic == "state" else 0,
-        hearing=Hearing(first, heard.count, NEIGHBOUR_SIZE) if heard.count else None,
     )
     return PPO.make(
         config.algo,

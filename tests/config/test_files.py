@@ -135,19 +135,6 @@ def test_a_sequence_takes_names_paths_beside_its_file_and_stages(tmp_path):
     assert [stage.name for stage in train.stage] == ["s1", "wide", "own"]
 
 
-def test_a_grid_is_one_file(own_configs):
-    axes = "grid: {robots: [1, 2], obstacles: [1], side: [1, 2]}\n"
-    (own_configs / "stage" / "mine.yaml").write_text(axes)
-    train = load_train(["stage=mine"])
-    assert train.stage_name == "mine"
-    assert [(s.robots, s.obstacles, s.side) for s in train.stage] == [
-        (1, 1, 1.0),
-        (1, 1, 2.0),
-        (2, 1, 1.0),
-        (2, 1, 2.0),
-    ]
-
-
 @pytest.mark.parametrize(
     ("text", "part"),
     [
@@ -157,9 +144,7 @@ def test_a_grid_is_one_file(own_configs):
         ("name: mine\nrobot: 4\nside: 1\n", "stage.robot is not a key: did you mean stage.robots?"),
         ("name: [\n", "mine.yaml"),
         ("- a\n", "mine.yaml"),
-        ("grid: 3\n", "stage.grid is 3: give its keys, such as stage.grid.robots"),
-        ("grid: {robots: [2]}\n", "stage.grid.side is missing"),
-        ("grid: {robots: [2], side: [1]}\nrobots: 3\n", "stage.robots cannot be given for mine"),
+        ("sequence: [s1]\nrobots: 3\n", "stage.robots cannot be given for mine"),
     ],
 )
 def test_an_unsound_stage_file_is_one_sentence(own_configs, text, part):

@@ -25,7 +25,7 @@ from swarmjax.task.stage_config import StageConfig
 
 NAMES = files.choices("suites")
 # These suites share levels with other suites, for comparison level by level or as a selection.
-REPEATED = {"shapes", "noise", "headline", "scaling"}
+REPEATED = {"noise", "headline", "scaling"}
 
 
 def _text(*cells: str) -> str:
@@ -38,7 +38,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     file.write_text(
         _text(
             "name: one, stage: s1, levels: 3, seed: 1000001",
-            "name: two, stage: s3, levels: 2, seed: 1000002, shape: ell, realism: real, "
+            "name: two, stage: s3, levels: 2, seed: 1000002, realism: real, "
             "steps: 70, hull_friction: 0.5",
             "name: some, stage: {robots: 3, side: [0.9, 1.1], obstacles: 1}, levels: 2, "
             "seed: 1000003, episodes: [7, 4]",
@@ -76,7 +76,7 @@ def test_a_file_of_levels_gives_them_back(tmp_path: Path, tiny: Suite) -> None:
     assert found.name == "tiny"
     for mine, theirs in zip(found.cells, tiny.cells, strict=True):
         assert mine.digest == theirs.digest
-        assert mine[:5] == theirs[:5]
+        assert mine[:4] == theirs[:4]
         assert (mine.steps, mine.hull_friction) == (theirs.steps, theirs.hull_friction)
         for a, b in zip(mine.levels, theirs.levels, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -199,8 +199,8 @@ def test_pickles_are_not_opened(tmp_path: Path, tiny: Suite) -> None:
 
 def test_the_suites_are_those_of_the_manual() -> None:
     assert set(NAMES) == {
-        "adversarial", "dense", "dev", "expanded", "headline", "noise", "scaling", "shapes",
-        "stages", "swarm", "worlds", "worlds_dev", "worlds_far",
+        "adversarial", "dense", "dev", "expanded", "headline", "noise", "scaling", "stages",
+        "swarm", "worlds", "worlds_dev", "worlds_far",
     }  # fmt: skip
 
 
@@ -211,10 +211,8 @@ def test_a_suite_is_sound_and_its_first_levels_are_drawn(name: str) -> None:
     for cell in file.cells:
         assert cell.digest is not None
         drawn = cells.draw_cell(_first(cell))
-        assert (drawn.shape, drawn.realism) == (cell.shape, cell.realism)
-        # An obstacle of a shape consists of this many boxes; docs/evaluation.md describes them.
-        parts = {"box": 1, "bar": 1, "cross": 2, "ell": 2, "pillar": 4}[cell.shape]
-        assert drawn.levels.obstacle.shape[1] == parts * cell.stage.obstacles
+        assert drawn.realism == cell.realism
+        assert drawn.levels.obstacle.shape[1] == cell.stage.obstacles
 
 
 def _first(cell: CellConfig) -> CellConfig:
@@ -267,9 +265,11 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
     [
         ("name: x\n", "cells is missing and has no default: give it."),
         (_text("name: a, stage: s9, seed: 1000000"), "stage is 's9': give one of "),
-        (_text("name: a, stage: grid, seed: 1000000"), "stage is grid, which names several stages"),
+        (
+            _text("name: a, stage: worlds, seed: 1000000"),
+            "stage is worlds, which names several stages",
+        ),
         (_text("name: a, stage: s1, seed: 5"), "seed is 5: give 1000000 to 2147483647."),
-        (_text("name: a, stage: s1, seed: 1000000, shape: ball"), "shape is 'ball': give box, "),
         (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1]"), "levels is 2, but"),
         (_text("name: a b, stage: s1, seed: 1000000"), "name is 'a b': give letters, digits"),
         (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells names a more than once"),

@@ -147,7 +147,7 @@ def _trial(name: str, *, seed: int = 1_000_000, first: int = 0, **stage: Any) ->
     numbers = np.arange(first, first + 10)
     plain = StageConfig(**({"name": name, "robots": 2, "side": 1.0} | stage))
     levels: Any = None
-    cell = Cell(name, plain, "box", None, seed, numbers, levels)
+    cell = Cell(name, plain, None, seed, numbers, levels)
     found = {"spl": np.random.default_rng(first).random((1, 10))}
     return Trial(cell, np.ones((10, 2)), found)
 
@@ -203,7 +203,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
 ) -> None:
     path, out = steering.write(tmp_path / "policy.npz"), tmp_path / "new" / "result.json"
     words = (f"policy={path}", "stage=s1", "episodes=3", "steps=20", "seed=5", "workers=1")
-    rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.stall=0.01")
+    rules = ("robot.mass=0.2", "task.target_radius=0.06", "realism.speed_noise=0.01")
     assert _command(monkeypatch, *words, *rules, f"out={out}") == 0
     result = json.loads(out.read_text())
     assert [path.name for path in out.parent.iterdir()] == ["result.json"]
@@ -216,7 +216,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
     }
     assert result["robot"] == _plain(RobotConfig(body="wheeled", mass=0.2))
     assert result["task"] == _plain(TaskConfig(target_radius=0.06))
-    assert result["cells"][0]["realism"] == _plain(RealismConfig(stall=0.01))
+    assert result["cells"][0]["realism"] == _plain(RealismConfig(speed_noise=0.01))
     assert result["policies"] == [{"path": str(path), "digest": policy.load(path).digest}]
     assert result["versions"]["mujoco"] == mujoco.__version__
     (cell,) = result["cells"]
@@ -236,7 +236,7 @@ def suite(tmp_path: Path) -> Path:
     file.write_text(
         "name: tiny\ncells:\n"
         "  - {name: one, stage: s1, levels: 4, seed: 1000001}\n"
-        "  - {name: two, stage: s3, levels: 5, seed: 1000002, shape: bar, realism: webots}\n"
+        "  - {name: two, stage: s3, levels: 5, seed: 1000002, realism: webots}\n"
     )
     drawn = [cells.draw_cell(each) for each in read_suite(str(file)).cells]
     cells.write(tmp_path / "tiny.npz", cells.Suite("tiny", tuple(drawn)))

@@ -94,11 +94,6 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
     assert (found.name, found.side) == ("s3", 1.1)
 
 
-def test_a_cell_of_a_grid_is_judged_without_a_file(tmp_path: Path) -> None:
-    word = _policy(tmp_path / "p.npz", "stage=grid", "curriculum.mode=adaptive")
-    assert _load(word).stage.name == "r5-o3-s120"
-
-
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = trained_settings.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
     assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")

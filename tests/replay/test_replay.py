@@ -81,9 +81,7 @@ def test_the_worst_are_replayed(steer, tmp_path, capsys):
 
 def test_policies_replay_the_same_levels(steer, tmp_path):
     ahead = steering.write(tmp_path / "ahead.npz", steering.AHEAD)
-    settings = load_levels(
-        ReplayConfig, [f"policy={steer},{ahead}", *QUICK, "level=2", "shape=cross"]
-    )
+    settings = load_levels(ReplayConfig, [f"policy={steer},{ahead}", *QUICK, "level=2"])
     entrants = trials.read_policies(settings.policies)
     progress = replay.Progress(disable=True)
     (episode,) = replay.replay(settings, entrants, progress)
@@ -91,7 +89,6 @@ def test_policies_replay_the_same_levels(steer, tmp_path):
     np.testing.assert_array_equal(first.pose[0], second.pose[0])
     np.testing.assert_array_equal(first.scene.target, second.scene.target)
     assert np.abs(first.pose[-1] - second.pose[-1]).max() > 0.01
-    assert len(first.scene.box) == 2 * 2  # a cross is two boxes
 
 
 @pytest.fixture
@@ -126,7 +123,7 @@ def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
 
 
 def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
-    words = [f"policy={steer}", *QUICK, "shape=cross", "seed=5", "robot.hull_radius=0.035"]
+    words = [f"policy={steer}", *QUICK, "seed=5", "robot.hull_radius=0.035"]
     settings = load_levels(ReplayConfig, [*words, "level=7,2"])
     every = cells.draw_stage(settings.evaluation, range(8))
     drawn, draw = [], judge.draw_level

@@ -39,7 +39,6 @@ def test_stages_are_the_table_of_the_plan():
         "s4": (3, 1.0, 2),
         "s5": (5, 1.0, 2),
         "s6": (5, 1.2, 3),
-        "final": (5, 1.2, 3),
         "expanded": (5, 1.5, 3),
     }
     for name, numbers in table.items():
@@ -50,7 +49,7 @@ def test_stages_are_the_table_of_the_plan():
 
 def test_every_stage_file_can_be_trained():
     files = {path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")}
-    assert files >= {"curriculum", "grid", "final", "expanded"}
+    assert files >= {"curriculum", "worlds", "expanded"}
     for name in files:
         train = load_train([f"stage={name}", "sim.max_robots=100", "sim.max_obstacles=32"])
         assert train.stage_name == name
@@ -210,36 +209,9 @@ def test_import_needs_neither_jax_nor_hydra():
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
          "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
          "keep or mode=sequential."),
-        # Grids.
-        (["stage=grid", "stage.side=1"], "stage.side cannot be given for grid, a grid: give its "
-         "axes, as in stage.grid.side=[0.7,1.0]."),
-        (["stage=grid", "stage.grid.robots=[]", "stage.grid.side=[1]"], "stage.grid.side is [1], "
-         "which no cell of the grid fits with robots=[] and obstacles=[0,1,2,3]: give at least one "
-         "number of each, and larger sides."),
-        (["stage=grid", "stage.grid.robots=[2,6]", "sim.max_robots=5"], "stage r6-o0-s70: robots "
-         "is 6, but sim.max_robots is 5: give 1 to 5."),
-        (["stage=grid", "stage.grid.robot=[2]"], "stage.grid.robot is not a key: did you mean "
-         "stage.grid.robots?"),
-        (["stage=grid", "stage.grid.side=1"], "stage.grid.side is 1: give a list, as in "
-         "[0.7,[0.8,1.2]]."),
-        (["stage=grid", "stage.grid.side=[[0.1,1]]"], "stage.grid.side is [[0.1,1]]: give 0.4 to "
-         "4."),
-        (["stage=grid", "stage.grid.side=[1,[1.2,1]]"], "stage.grid.side is [1.2,1]: give the "
-         "lower number first."),
-        (["stage=grid", "stage.grid.side=[1,1]"], "stage names r2-o0-s100 more than once: give "
-         "each stage once."),
-        # 0.10 + sqrt(5 * 2 * 0.15**2) = 0.10 + 0.4743 m.
-        (["stage=grid", "stage.grid.side=[0.4,0.5]", "stage.grid.robots=[5]"], "stage.grid.side "
-         "is [0.4,0.5], which no cell of the grid fits with robots=[5] and obstacles=[0,1,2,3]: "
-         "give at least one number of each, and larger sides."),
-        (["stage.sequence=[s1,grid]"], "stage.sequence is grid, which names several stages: "
+        (["stage.sequence=[s1,worlds]"], "stage.sequence is worlds, which names several stages: "
          "give single stages."),
         # Checks across keys.
-        (["task.neighbours.count=33"], "task.neighbours.count is 33: give 0 to 32."),
-        (["task.neighbours.count=2", "algo.network=mine"], "algo.network is mine, but "
-         "task.neighbours.count is 2, which works only with hidden layers: give algo.network=mlp "
-         "or task.neighbours.count=0."),
-        (["realism.packet_loss=1.5"], "realism.packet_loss is 1.5: give 0 to 1."),
         (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
          "inside the hull: give less than 0.074."),
         (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "
@@ -264,7 +236,6 @@ def test_train_refuses(words, sentence):
     [
         (["stage=curriculum"], "stage is curriculum, a curriculum: give one stage, as in "
          "stage=s6."),
-        (["stage=grid"], "stage is grid, a grid: give one stage, as in stage=s6."),
         (["suite=all", "stage=s6"], "stage cannot be given with suite=all, which sets its own "
          "levels: leave stage or suite out."),
         (["suite=all", "seed=2"], "seed cannot be given with suite=all, which sets its own "
@@ -273,13 +244,10 @@ def test_train_refuses(words, sentence):
          "compare=FILE,FILE."),
         (["policy=null"], "policy is null and compare is null: give one of them, policy=FILE or "
          "compare=FILE,FILE."),
-        (["shape=ball"], "shape is 'ball': give box, bar, cross, ell or pillar."),
-        (["shape=bar", "stage.level=fixed"], "shape is bar, but stage.level is fixed, with "
-         "obstacles of its own: give shape=box."),
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
-        (["algo=ppo"], "algo is not a key: give one of stage, robot, task, suite, shape, realism, "
-         "action, steps, episodes, seed, workers, substeps, extensions, policy, "
+        (["algo=ppo"], "algo is not a key: give one of stage, robot, task, suite, realism, action, "
+         "steps, episodes, seed, workers, substeps, extensions, policy, "
          "compare, engine, out."),
     ],
 )  # fmt: skip
@@ -328,42 +296,6 @@ def test_a_side_may_be_a_range():
     assert load_train(["stage=s6"]).stage[0].sides == (1.2, 1.2)
     made = build(TrainConfig, {"stage": [to_dict(stage)]})
     assert made.stage == (stage,)
-
-
-# Grids
-
-
-def test_grid():
-    train = load_train(["stage=grid"])
-    names = [stage.name for stage in train.stage]
-    assert train.stage_name == "grid"
-    assert names[:6] == [
-        "r2-o0-s50", "r2-o0-s70", "r2-o0-s100", "r2-o0-s120", "r2-o1-s50", "r2-o1-s70",
-    ]  # fmt: skip
-    # A side of 0.5 m is too small for 5 robots (they need 0.58 m), for one obstacle with 3 or 5
-    # robots (0.54 m and more: 0.10 + sqrt(3 * 0.045 + 0.0583)), and for two obstacles (0.64 m) or
-    # three (0.76 m) with any number of robots. A side of 0.7 m is too small for three obstacles.
-    # 48 - 1 - 2 - 3 - 6 stages are left.
-    assert len(names) == 36
-    assert not {"r5-o0-s50", "r3-o1-s50", "r2-o2-s50", "r2-o3-s70"} & set(names)
-    assert {"r3-o0-s50", "r2-o1-s50", "r5-o2-s70", "r2-o3-s100"} <= set(names)
-    (goal,) = load_train(["stage=s6"]).stage
-    assert train.stage[-1] == dataclasses.replace(goal, name="r5-o3-s120")
-    assert build(TrainConfig, to_dict(train)) == train
-
-
-def test_a_grid_of_ones_own():
-    words = ["robots=[3]", "obstacles=[1,0]", "side=[0.755,[0.8,1.25]]", "obstacle_size=0.2"]
-    train = load_train(["stage=grid", *(f"stage.grid.{word}" for word in words)])
-    # The stages follow the order of the axes. A box of 0.2 m needs a side of
-    # 0.10 + (0.2 sqrt(2) + 0.10) / sqrt(0.4) = 0.71 m.
-    assert [(stage.name, stage.side) for stage in train.stage] == [
-        ("r3-o1-s75_5", 0.755),
-        ("r3-o1-s80-125", (0.8, 1.25)),
-        ("r3-o0-s75_5", 0.755),
-        ("r3-o0-s80-125", (0.8, 1.25)),
-    ]
-    assert {stage.obstacle_size for stage in train.stage} == {0.2}
 
 
 # The room that a stage needs

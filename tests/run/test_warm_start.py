@@ -252,10 +252,6 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
             "algo.critic is observation, but here it is state: give algo.critic=observation",
         ),
         (
-            ["task.neighbours.count=2"],
-            "task.neighbours.count is 0, but here it is 2: give task.neighbours.count=0",
-        ),
-        (
             ["algo.activation=relu"],
             "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
         ),

@@ -153,17 +153,12 @@ def test_two_robots_side_by_side_see_each_other_and_not_themselves(xp: ModuleTyp
 
 
 @MODULES
-def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
-    xp: ModuleType,
-) -> None:
+def test_a_crooked_sensor_looks_where_it_is_turned(xp: ModuleType) -> None:
     """Checks the rays of two robots that face +y; the second robot's right sensor is crooked."""
     pose = xp.array(_f32([0.1, 0.2, math.pi / 2], [-0.3, 0.0, math.pi / 2]))
     yaw = np.zeros((2, 8), np.float32)
     yaw[1, 2] = math.pi / 6
-    shift = np.zeros((2, 8, 2), np.float32)
-    shift[1, 2] = 0.002, 0.003  # 2 mm forward, 3 mm to the left
-    mount = infrared.Mount(yaw=xp.array(yaw), position=xp.array(shift))
-    origin, direction = infrared.rays(pose, xp, mount)
+    origin, direction = infrared.rays(pose, xp, xp.array(yaw))
     straight = infrared.rays(pose, xp)
     for found, nominal in zip((origin, direction), straight, strict=True):
         keep = np.ones((2, 8), bool)
@@ -171,9 +166,8 @@ def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
         np.testing.assert_allclose(
             np.asarray(found)[keep], np.asarray(nominal)[keep], atol=ROUNDING
         )
-    # Forward is +y and left is -x. In its robot's frame the shift moves the sensor from (0, -0.031)
-    # to (0.002, -0.028).
-    np.testing.assert_allclose(origin[1, 2], [-0.3 + 0.028, 0.002], atol=ROUNDING)
+    # Forward is +y and left is -x. In its robot's frame the sensor is at (0, -0.031).
+    np.testing.assert_allclose(origin[1, 2], [-0.3 + 0.031, 0.0], atol=ROUNDING)
     # A straight sensor would look along +x, the robot's right. This sensor is turned by 30 degrees
     # to the left, towards +y.
     np.testing.assert_allclose(
@@ -184,20 +178,16 @@ def test_a_crooked_sensor_looks_where_it_is_turned_from_where_it_is_shifted(
 @MODULES
 def test_a_crooked_sensor_measures_along_its_own_ray(xp: ModuleType) -> None:
     pose = xp.array(_f32([0.45, 0.0, 0.0]))
-    yaw, shift = np.zeros((1, 8), np.float32), np.zeros((1, 8, 2), np.float32)
+    yaw = np.zeros((1, 8), np.float32)
     yaw[0, 7] = -0.29920  # straight ahead
-    shift[0, 7, 0] = -0.001
-    shift[0, 0, 0] = 0.001
-    mount = infrared.Mount(yaw=xp.array(yaw), position=xp.array(shift))
-    found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, mount)[0]
-    # The wall is 0.05 m ahead of the centre. The two front sensors sit 0.030 m ahead of the centre
-    # before their shifts.
+    found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, xp.array(yaw))[0]
+    # The wall is 0.05 m ahead of the centre. The two front sensors sit 0.030 m ahead of the centre.
     np.testing.assert_allclose(
-        found[np.array([0, 7])], [0.019 / math.cos(0.30081), 0.021], atol=ROUNDING
+        found[np.array([0, 7])], [0.020 / math.cos(0.30081), 0.020], atol=ROUNDING
     )
 
 
-SHADES = {"wall": 0.9, "obstacle": (0.6, 0.7), "robot": (0.3, 0.4, 0.5)}
+SHADES = {"fixture": (0.9, 0.6, 0.7), "robot": (0.3, 0.4, 0.5)}
 
 
 def _reflectance(xp: ModuleType, **shades: Any) -> infrared.Reflectance:
@@ -454,9 +444,8 @@ def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> Non
     # One reflectance for each geom, in MuJoCo's order: the robots, the boxes and the four walls.
     shade = np.array([0.30, 0.31, 0.32, 0.33, 0.34, 0.60, 0.61, *[0.9] * 4])
     reflectance = infrared.Reflectance(
-        wall=xp.full(MANY, shade[-1], kind),
+        fixture=xp.array(np.tile([0.9, *shade[ROBOTS:-4]], (MANY, 1)), kind),
         robot=xp.array(np.tile(shade[:ROBOTS], (MANY, 1)), kind),
-        obstacle=xp.array(np.tile(shade[ROBOTS:-4], (MANY, 1)), kind),
     )
     side = xp.full(MANY, ARENA, kind)
     pose, box = xp.array(pose, kind), xp.array(box, kind)

@@ -73,20 +73,20 @@ def test_streams_differ() -> None:
 
 
 def test_uniform_is_the_upper_24_bits() -> None:
-    bits = noise.bits(np.uint32(5), 2, Stream.STALL, (1000,), np)
-    found = noise.uniform(np.uint32(5), 2, Stream.STALL, (1000,), np)
+    bits = noise.bits(np.uint32(5), 2, Stream.ACTION, (1000,), np)
+    found = noise.uniform(np.uint32(5), 2, Stream.ACTION, (1000,), np)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, (bits // 256) / 2**24)
 
 
 def test_normal_is_box_and_muller() -> None:
-    drawn = noise.uniform(np.uint32(5), 2, Stream.STALL, (500, 2), np).astype(float)
+    drawn = noise.uniform(np.uint32(5), 2, Stream.ACTION, (500, 2), np).astype(float)
     expected = [
         math.sqrt(-2 * math.log(1 - u)) * f(2 * math.pi * v)
         for u, v in drawn
         for f in (math.cos, math.sin)
     ]
-    found = noise.normal(np.uint32(5), 2, Stream.STALL, (999,), np)
+    found = noise.normal(np.uint32(5), 2, Stream.ACTION, (999,), np)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, expected[:999], atol=ULPS)
 
@@ -131,22 +131,22 @@ def test_leading_axes_are_single_draws(kind: str) -> None:
     draw = getattr(noise, kind)
     seeds = np.arange(6, dtype=np.uint32).reshape(2, 3)
     clocks = 10 * seeds.astype(np.int32)
-    both = draw(seeds, clocks, Stream.STALL, (5,), np)
-    common = draw(seeds, 7, Stream.STALL, (5,), np)
+    both = draw(seeds, clocks, Stream.ACTION, (5,), np)
+    common = draw(seeds, 7, Stream.ACTION, (5,), np)
     # Bits and uniform numbers agree exactly. NumPy's SIMD and scalar code for log and cos may
     # differ in the last bits.
     tolerance = ULPS if kind == "normal" else 0
     for place in np.ndindex(2, 3):
-        one = draw(seeds[place], int(clocks[place]), Stream.STALL, (5,), np)
+        one = draw(seeds[place], int(clocks[place]), Stream.ACTION, (5,), np)
         np.testing.assert_allclose(both[place], one, rtol=0, atol=tolerance)
-        one = draw(seeds[place], 7, Stream.STALL, (5,), np)
+        one = draw(seeds[place], 7, Stream.ACTION, (5,), np)
         np.testing.assert_allclose(common[place], one, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("kind", ["bits", "uniform", "normal"])
 def test_more_robots_leave_the_numbers_of_the_first_alone(kind: str) -> None:
     draw = getattr(noise, kind)
-    few, many = (draw(np.uint32(9), 4, Stream.STALL, (n, 3), np) for n in (3, 8))
+    few, many = (draw(np.uint32(9), 4, Stream.ACTION, (n, 3), np) for n in (3, 8))
     tolerance = ULPS if kind == "normal" else 0  # as above
     np.testing.assert_allclose(few, many[:3], rtol=0, atol=tolerance)
 

@@ -138,7 +138,6 @@ def test_compiled_over_a_batch_jax_reads_what_numpy_reads(name: Any) -> None:
     wear = Wear(
         noise=draw.uniform(0.6, 3.5, shape),
         gain=draw.uniform(0.7, 1.3, shape),
-        offset=draw.normal(0.0, 3.0, shape),
         dead=draw.uniform(size=shape) < 0.1,
     )
     given = draw.uniform(0.0, 0.12, shape), draw.uniform(0.35, 1.0, shape), wear
@@ -347,37 +346,33 @@ def test_reflectance_of_a_measured_robot_is_a_share_of_what_comes_back(xp: Modul
 
 
 @MODULES
-def test_gain_offset_and_dead_of_webots(xp: ModuleType) -> None:
+def test_gain_and_dead_of_webots(xp: ModuleType) -> None:
     """Checks rays of length 0.04 m: 158.03 counts, of which 67.19 are the counts of free space."""
     wear = Wear(
         gain=xp.array(_f32(1.0, 1.2, 0.7, 1.2, 1.0, 1.2, 1.2, 1.0)),
-        offset=xp.array(_f32(0.0, 0.0, 0.0, 3.0, -2.0, 4.0, 4.0, 0.0)),
         dead=xp.array([False, False, False, False, False, True, False, True]),
     )
     ray = xp.full(8, 0.04 * TILT, xp.float32)
     found = response.read("webots", ray, None, wear, None, xp)
     echo = 158.03 - 67.19
-    expected = [158.03, 67.19 + 1.2 * echo, 67.19 + 0.7 * echo, 70.19 + 1.2 * echo, 156.03]
-    expected += [71.19, 71.19 + 1.2 * echo, 67.19]
+    expected = [158.03, 67.19 + 1.2 * echo, 67.19 + 0.7 * echo, 67.19 + 1.2 * echo, 158.03]
+    expected += [67.19, 67.19 + 1.2 * echo, 67.19]
     np.testing.assert_allclose(found, expected, atol=ROUNDING)
     # A normal number of 1 and a noise factor of 2 add two standard deviations. The noise is a share
-    # of the counts from table and gain, without the offset. A dead sensor has the noise of free
-    # space.
+    # of the counts from table and gain. A dead sensor has the noise of free space.
     share = np.array([0.0287] * 5 + [0.04897, 0.0287, 0.04897])
-    offset = np.asarray(wear.offset)
     noisy = response.read("webots", ray, None, wear._replace(noise=xp.full(8, 2.0)), xp.ones(8), xp)
-    np.testing.assert_allclose(noisy, (expected - offset) * (1 + 2 * share) + offset, atol=ROUNDING)
+    np.testing.assert_allclose(noisy, expected * (1 + 2 * share), atol=ROUNDING)
 
 
 @MODULES
-def test_gain_offset_and_dead_of_a_measured_robot(xp: ModuleType) -> None:
+def test_gain_and_dead_of_a_measured_robot(xp: ModuleType) -> None:
     strength, depth, _, sd, _ = np.array(epuck.INFRARED_FIT).T
     gain = _f32(1.0, 1.3, 0.7, 1.3, 1.0, 1.3, 1.3, 1.0)
-    offset = _f32(0.0, 0.0, 0.0, 3.0, -2.0, 4.0, 4.0, 0.0)
     dead = np.array([False, False, False, False, False, True, False, True])
-    wear = Wear(gain=xp.array(gain), offset=xp.array(offset), dead=xp.array(dead))
+    wear = Wear(gain=xp.array(gain), dead=xp.array(dead))
     ray = xp.array(_f32(TO_HULL + 0.03)[0])
-    expected = np.where(dead, 0.0, gain * strength / (0.03 + depth) ** 2) + offset
+    expected = np.where(dead, 0.0, gain * strength / (0.03 + depth) ** 2)
     found = response.read("real", ray, None, wear, None, xp)
     np.testing.assert_allclose(found, expected, atol=ROUNDING)
     noisy = wear._replace(noise=xp.full(8, 2.0))

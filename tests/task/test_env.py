@@ -530,17 +530,16 @@ def test_a_restarted_arena_has_the_robots_of_its_new_episode(real: Drawn) -> Non
     np.testing.assert_array_equal(after.level.seed != state.level.seed, new)
     np.testing.assert_array_equal(after.cohort, new)  # waiting levels are of cohort 1
     seeds, world = np.asarray(after.level.seed), real.world
-    expected = task_factors.draw(seeds, world.realism, world.robot, 3, 1, np)
+    expected = task_factors.draw(seeds, world.realism, 3, 1, np)
     for found, mine in zip(after.factors, expected, strict=True):
         assert found is not None
         assert mine is not None
         # The tolerance covers the rounding of low + u * (high - low), and of log and cos.
         np.testing.assert_allclose(found, mine, rtol=2e-6, atol=1e-6)
-    # Nothing of the old episode is left: no command is queued or held, and the stored observations
-    # are the current one.
-    motor, infrared, seen = jax.tree.map(np.asarray, after.memory)
-    assert motor.queue[~new, 0].all()
-    assert not motor.queue[new].any()
-    assert not motor.held[new].any()
+    # Nothing of the old episode is left: no command is queued, and the stored observations are the
+    # current one.
+    commands, infrared, seen = jax.tree.map(np.asarray, after.memory)
+    assert commands[~new, 0].all()
+    assert not commands[new].any()
     np.testing.assert_array_equal(seen[new, 0], after.observation[new])
     np.testing.assert_array_equal(infrared[new], after.observation[new][..., INFRARED])

@@ -332,14 +332,18 @@ def _change(name: str, **changed: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "changed", "said"),
     [
-        ("trap", {"side": 0.6}, "side is 0.6, too small for level=trap with robots=1 and width="),
+        ("trap", {"side": 0.5}, "stage world_trap: level=trap has no room for 1 robots, since "),
         ("door", {"gap": 0.07}, "gap is 0.07: give 0.08 to 1."),
         ("maze", {"cells": None}, "cells is missing: level=maze needs cells."),
         ("row", {"apart": None}, "apart is missing: level=row needs gap and apart."),
         ("circle", {"depth": 0.2}, "depth is 0.2, but level is circle, which has none: leave "),
         ("bay", {"robots": 3}, "robots is 3, but level=bay has room for 2: give at most that."),
-        ("fence", {"length": 0.75}, "breadth is 0.8, too small for level=fence with robots=5 "),
-        ("crowd", {"robots": 80}, "side is 1.2, too small for level=crowd with robots=80 and "),
+        ("fence", {"side": 0.4}, "stage world_fence: level=fence has no room for 5 robots, since "),
+        (
+            "crowd",
+            {"side": 0.6},
+            "stage world_crowd: level=crowd has no room for 40 robots, since ",
+        ),
         (
             "circle",
             {"radius": 0.15},
@@ -349,14 +353,6 @@ def _change(name: str, **changed: Any) -> None:
 )
 def test_refuses_numbers_without_room(name: str, changed: dict[str, Any], said: str) -> None:
     assert refusal(partial(_change, name, **changed)).startswith(said)
-
-
-def test_refuses_a_door_narrower_than_a_robot() -> None:
-    stage = _stage("door", gap=0.09)
-    spacing = _spacing(stage)._replace(hull_radius=0.045)
-    assert refusal(room.check, [stage], spacing) == (
-        "stage world_door: gap is 0.09, but a robot is 0.09 m wide: give at least 0.096."
-    )
 
 
 def test_a_layout_sets_its_number_of_walls() -> None:

@@ -140,8 +140,10 @@ def test_a_map_goes_with_its_level(given: dict) -> None:
 )
 def test_refuses_areas_without_room(text: str, robots: int, where: str) -> None:
     said = refusal(room.check, [_stage(text, robots)], SPACING)
-    assert said.startswith(f"stage drawn: level=map has no room for {robots} robots, since robots")
-    assert said.endswith(f" overlap where each {where}: give fewer robots, or more space.")
+    assert said.startswith(f"stage drawn: level=map has no room for {robots} robots, since robot ")
+    assert said.endswith(
+        f" overlaps another robot where it {where}: give fewer robots, or more space."
+    )
 
 
 def test_areas_with_room_are_taken() -> None:

@@ -19,7 +19,7 @@ from swarmjax.task.config import TaskConfig, resolve_encoding
 from swarmjax.task.stage_files import load_levels
 
 OFF = {item.name: None for item in dataclasses.fields(RealismConfig)}
-IDEAL = OFF | {"name": "ideal", "infrared": "ideal", "stall_time": (0.1, 0.3)}
+IDEAL = OFF | {"name": "ideal", "infrared": "ideal"}
 WEBOTS = IDEAL | {
     "name": "webots",
     "infrared": "webots",
@@ -33,16 +33,12 @@ REAL = {
     "infrared": "real",
     "infrared_noise": (0.5, 2.0),  # factor on the model's noise
     "infrared_gain": (0.7, 1.3),
-    "infrared_offset": 3.0,
     "infrared_yaw": 0.0349,  # 2 degrees: 2 * 3.1416 / 180 = 0.03491
-    "infrared_position": 0.001,
     "infrared_period": (0.01, 0.05),  # 100 Hz and 20 Hz
-    "reflectance_wall": (0.35, 1.0),
-    "reflectance_obstacle": (0.35, 1.0),
+    "reflectance": (0.35, 1.0),
     "reflectance_robot": (0.35, 1.0),
     "dead_sensor": 0.02,
     "wheel_radius": (0.0198, 0.0207),
-    "wheel_mismatch": 0.005,
     "track": (0.052, 0.0575),
     "max_wheel_speed": (6.0, 6.9),
     "mass": (0.13, 0.20),
@@ -50,16 +46,11 @@ REAL = {
     "speed_noise": 0.05,
     "speed_quantisation": "epuck2",
     "action_latency": (0, 2),
-    "stall": 0.01,
-    "stall_time": (0.1, 0.3),
     "observation_latency": (0, 1),
     "target_distance_noise": 0.005,
     "target_bearing_noise": 0.0524,  # 3 degrees: 3 * 3.1416 / 180 = 0.05236
-    "packet_loss": 0.85,
-    "neighbour_distance_noise": 0.015,
-    "neighbour_bearing_noise": 0.0873,  # 5 degrees: 5 * 3.1416 / 180 = 0.08727
 }
-FACTORS = sorted(REAL.keys() - {"name", "infrared", "stall_time"})
+FACTORS = sorted(REAL.keys() - {"name", "infrared"})
 LOADS = [load_train, lambda words: load_levels(EvaluateConfig, ["policy=p", *words])]
 
 
@@ -208,8 +199,6 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "numbers or null."),
         (["realism.action_latency=[0,1.5]"], "realism.action_latency is [0,1.5]: give a range "
          "[low,high] of whole numbers or null."),
-        (["realism.stall_time=null"], "realism.stall_time is null: give a range [low,high] of "
-         "numbers."),
         (["realism.mass=[0.2,0.13]"], "realism.mass is [0.2,0.13]: give the lower number first."),
         # Words.
         (["realism=null"], "realism is 'null': give one of ideal, real, webots."),
@@ -226,8 +215,6 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         # Sensors that have no counts.
         (["realism.infrared_gain=[0.7,1.3]"], "realism.infrared_gain is [0.7,1.3], but infrared "
          "is ideal and has no counts: give null, or infrared=webots or infrared=real."),
-        (["realism.infrared_offset=3"], "realism.infrared_offset is 3, but infrared is ideal and "
-         "has no counts: give null, or infrared=webots or infrared=real."),
         (["realism=webots", "realism.infrared=ideal"], "realism.infrared_noise is [1,1], but "
          "infrared is ideal and has no counts: give null, or infrared=webots or infrared=real."),
         # Impossible bodies.
@@ -255,15 +242,11 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["realism.max_wheel_speed=[0,6]"], "realism.max_wheel_speed is [0,6]: give 0.001 "
          "to 1000."),
         (["realism.speed_noise=-0.05"], "realism.speed_noise is -0.05: give 0 to 1."),
-        (["realism.wheel_mismatch=0.5"], "realism.wheel_mismatch is 0.5: give 0 to 0.1."),
         (["realism.dead_sensor=1.1"], "realism.dead_sensor is 1.1: give 0 to 1."),
-        (["realism.stall=2"], "realism.stall is 2: give 0 to 1."),
-        (["realism.stall_time=[0,0.3]"], "realism.stall_time is [0,0.3]: give more than 0, "
-         "at most 3600."),
         (["realism.target_distance_noise=-1"], "realism.target_distance_noise is -1: give 0 to "
          "10."),
-        (["realism=real", "realism.reflectance_wall=[0,1]"], "realism.reflectance_wall is [0,1]: "
-         "give more than 0, at most 1."),
+        (["realism=real", "realism.reflectance=[0,1]"], "realism.reflectance is [0,1]: give more "
+         "than 0, at most 1."),
         # Times longer than the episode, whose 500 control steps of 0.032 s are 16 s.
         (["realism.action_latency=[0,500]"], "realism.action_latency is [0,500], but an episode "
          "takes 500 control steps: give less than 500."),
@@ -273,8 +256,6 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "1000."),
         (["realism.infrared_period=[0.01,16]"], "realism.infrared_period is [0.01,16], but an "
          "episode takes 16 s: give less than 16."),
-        (["realism.stall=0.01", "realism.stall_time=[1,20]"], "realism.stall_time is [1,20], but "
-         "an episode takes 16 s: give less than 16."),
     ],
 )  # fmt: skip
 def test_train_refuses(words, sentence):
@@ -301,14 +282,7 @@ def test_evaluate_refuses(words, sentence):
 
 @pytest.mark.parametrize("factor", FACTORS)
 def test_metres_know_neither_noise_nor_gain_nor_reflectance(factor):
-    counted = {
-        "infrared_noise",
-        "infrared_gain",
-        "infrared_offset",
-        "reflectance_wall",
-        "reflectance_obstacle",
-        "reflectance_robot",
-    }
+    counted = {"infrared_noise", "infrared_gain", "reflectance", "reflectance_robot"}
     realism = {factor: REAL[factor]}
     if factor in counted:
         sentence = refusal(build, RealismConfig, realism)
@@ -323,14 +297,6 @@ def test_no_factor_is_negative(factor):
     value = [-1, 0] if isinstance(REAL[factor], tuple) else -1
     sentence = refusal(build, RealismConfig, {"infrared": "real", factor: value}, "realism.")
     assert sentence.startswith(f"realism.{factor} is {'[-1,0]' if value != -1 else -1}: give ")
-
-
-def test_what_is_off_is_not_held_to_the_episode():
-    # Without `stall`, the default stall_time of up to 0.3 s is not drawn, so it may be longer than
-    # the 0.096 s of 3 control steps.
-    assert load_train(["task.step_limit=3"]).realism.stall is None
-    sentence = refusal(load_train, ["task.step_limit=3", "realism.stall=0.1"])
-    assert sentence.startswith("realism.stall_time is [0.1,0.3], but an episode takes 0.096 s")
 
 
 def test_the_inertia_of_wheels_bounds_the_wheeled_body_only():
@@ -366,10 +332,5 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     assert (
         f"realism.action_latency={mass} latency of commands, control steps; per robot and episode "
         "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
-    )
-    stall = "[0.1,0.3]" if mass == "null" else mass
-    assert (
-        f"realism.stall_time={stall} duration, s; per stall "
-        "(a range [low,high] of numbers more than 0, at most 3600)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)

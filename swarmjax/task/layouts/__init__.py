@@ -5,14 +5,14 @@ layouts share. `drawing.py` turns a layout into a level. Lengths are whole units
 NumPy and JAX draw the same bits. The package may import `placement.py` and `sim.noise`.
 """
 
-from swarmjax.task.layouts import barriers, corridors, maze, open_floor
+from swarmjax.task.layouts import barriers, maze, open_floor
 from swarmjax.task.layouts.site import ArenaLayout
 
 LAYOUTS: dict[str, ArenaLayout] = {
     "trap": barriers.TRAP,
     "fence": barriers.FENCE,
-    "bay": corridors.BAY,
-    "row": corridors.ROW,
+    "bay": barriers.BAY,
+    "row": barriers.ROW,
     "door": barriers.DOOR,
     "maze": maze.MAZE,
     "circle": open_floor.CIRCLE,

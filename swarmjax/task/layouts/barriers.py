@@ -1,8 +1,9 @@
-"""Walls that stand between starts and targets: a trap, a fence, and a wall with a door.
+"""Walls that stand between starts and targets: a trap, a fence, a door, and two corridors.
 
 A trap is a U-shaped wall that opens towards the robots, with the targets behind it. A fence starts
 at one side of the arena and leaves a way around its end. A door joins two halls for one robot at a
-time, with robots going both ways.
+time, with robots going both ways. Corridors are for one robot at a time. One has a bay, where one
+robot lets the other pass. The other is a dead end, with targets one behind the other.
 """
 
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from swarmjax.task.layouts.site import (
+    MARGIN_UNITS,
     THICKNESS,
     ArenaLayout,
-    Demand,
     Drawn,
     Site,
     between,
@@ -27,8 +28,10 @@ Array = Any
 _ROOM = 0.20  # m, before the mouth and behind the trap: one start or target, and spare space
 _WAY = 0.14  # m, beside the trap: a hull (radius 0.045 m), 2 cm on either side, and 1 cm more
 _ASIDE = 0.1  # largest offset of a fence or a wall from the middle, as a share of half the arena
-_LEAST_WAY = 0.10  # m, around the end: a hull (radius 0.045 m), half a centimetre on either side
 _JAMB = 0.10  # m, least length of wall on either side of the door
+_ENDS = 0.10  # m, length of the target area at either end of the corridor
+_AHEAD = 0.20  # m, between one robot's target area and the other robot's start
+_BEFORE = 0.08  # m, from the first target to the mouth of the corridor
 
 
 def draw_trap(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -77,18 +80,11 @@ def _walls_of_trap(back: Array, middle: Array, width: Array, depth: Array, xp: A
     )
 
 
-def _least_trap(demand: Demand) -> tuple[float, float]:
-    thick = THICKNESS / 4096
-    side = demand["depth"] + thick + 2 * _ROOM
-    return side, demand["width"] + 2 * (thick + _WAY)
-
-
 TRAP = ArenaLayout(
     draw=draw_trap,
     uniforms=lambda robots, _: 6 + 2 * robots,
     walls=lambda _: 3,
     reads=("width", "depth"),
-    least=_least_trap,
     most_robots=4,
 )
 
@@ -128,18 +124,11 @@ def draw_fence(uniforms: Array, site: Site, xp: Any) -> Drawn:
     return Drawn(wall, np.ones(1, bool), start, target)
 
 
-def _least_fence(demand: Demand) -> tuple[float, float]:
-    # This is room for a row of starts on one side, a row of targets on the other, and the fence.
-    side = 2 * 0.15 * (1 + demand["robots"] // 5) / (1 - _ASIDE) + THICKNESS / 4096
-    return side, demand["length"] + _LEAST_WAY
-
-
 FENCE = ArenaLayout(
     draw=draw_fence,
     uniforms=lambda robots, _: 5 + 2 * robots,
     walls=lambda _: 1,
     reads=("length",),
-    least=_least_fence,
 )
 
 
@@ -196,18 +185,118 @@ def _hall(site: Site, where: Array, side: int, shifts: Array, xp: Any) -> tuple[
     )
 
 
-def _least_door(demand: Demand) -> tuple[float, float]:
-    gap, apart = demand["gap"], demand["apart"]
-    breadth = gap + 2 * _JAMB
-    # This area has a square of 0.15 m for each start and each target, and free space near the door.
-    area = demand["robots"] * 2 * 0.15**2 + 3.2 * apart**2
-    return max(2 * (apart + 0.15), area / max(demand["breadth"], breadth)) / (1 - _ASIDE), breadth
-
-
 DOOR = ArenaLayout(
     draw=draw_door,
     uniforms=lambda robots, _: 10 + 2 * robots,
     walls=lambda _: 2,
     reads=("gap", "apart"),
-    least=_least_door,
+)
+
+
+def draw_bay(uniforms: Array, site: Site, xp: Any) -> Drawn:
+    """Draws a corridor along x with a bay on its left.
+
+    Args:
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `gap` (of the corridor), `width` (at the bay) and `length`
+        (of the bay).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The layout. The first robot starts at the left end and the second at the right end. Each has
+      its target at the opposite end, behind the start of the other robot.
+    """
+    count = site.present.shape[0]
+    place, starts, targets, aside = split(uniforms, [2, count, count, 2 * count])
+    half_x, half_y = site.half[0], site.half[1]
+    gap, recess = site.numbers.gap, site.numbers.width - site.numbers.gap
+    most = xp.maximum(half_y - gap // 2 - recess - THICKNESS, 0)
+    middle = pick(place[0], -most, most, xp)
+    bay = pick(place[1], -(half_x // 4), half_x // 4, xp)
+    # The first robot goes right, the second left; there is no third.
+    way = xp.where(np.arange(count) % 2 == 0, 1, -1)
+    end = half_x - site.clear
+    last = round_up(_ENDS)
+    target_x = way * pick(targets, end - last, end, xp)
+    ahead = last + round_up(_AHEAD)
+    start_x = -way * pick(starts, end - ahead - last, end - ahead, xp)
+    most = xp.maximum(gap // 2 - site.hull - MARGIN_UNITS // 4, 0)
+    off = middle + pick(aside, -most, most, xp)
+    return Drawn(
+        wall=_walls_of_bay(site, bay, middle, recess, xp),
+        there=np.ones(4, bool),
+        start=xp.stack([start_x, off[:count]], axis=-1),
+        target=xp.stack([target_x, off[count:]], axis=-1),
+    )
+
+
+def _walls_of_bay(site: Site, bay: Array, middle: Array, recess: Array, xp: Any) -> Array:
+    """Returns the walls [4, 4] (units): the right wall, then the left walls around the bay."""
+    half_x, thin, aside = site.half[0], THICKNESS // 2, site.numbers.gap // 2
+    along = site.numbers.length // 2
+    left = between(-half_x, bay - along)
+    right = between(bay + along, half_x)
+    deep = (recess + 2 * thin + 1) // 2
+    upper = middle + aside
+    return rows(
+        (
+            (0 * bay, middle - aside - thin, half_x, thin),
+            (left[0], upper + deep, left[1], deep),
+            (right[0], upper + deep, right[1], deep),
+            (bay, upper + recess + thin, along, thin),
+        ),
+        xp,
+    )
+
+
+BAY = ArenaLayout(
+    draw=draw_bay,
+    uniforms=lambda robots, _: 2 + 4 * robots,
+    walls=lambda _: 4,
+    reads=("gap", "width", "length"),
+    most_robots=2,
+)
+
+
+def draw_row(uniforms: Array, site: Site, xp: Any) -> Drawn:
+    """Draws a corridor that ends at the arena's wall.
+
+    Args:
+      uniforms: [K] uniform numbers in [0, 1).
+      site: the arena; the layout reads `gap` (of the corridor) and `apart` (of the targets).
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      The layout. The first robot gets the deepest target. Robots start anywhere in the hall before
+      the corridor.
+    """
+    count = site.present.shape[0]
+    place, shift, starts = split(uniforms, [1, 2, count])
+    half_x, half_y = site.half[0], site.half[1]
+    gap, apart = site.numbers.gap, site.numbers.apart
+    robots = xp.sum(site.present.astype(xp.int32), dtype=xp.int32)
+    deepest = half_x - site.clear
+    mouth = deepest - (robots - 1) * apart - int(_BEFORE * 4096)
+    most = xp.maximum(half_y - gap // 2 - THICKNESS - 2 * site.hull - 2 * MARGIN_UNITS, 0)
+    middle = pick(place[0], -most, most, xp)
+    x = deepest - np.arange(count, dtype=np.int32) * apart
+    target = xp.stack([x, 0 * x + middle], axis=-1)
+    hall = points(
+        (site.clear - half_x, site.clear - half_y),
+        (mouth - site.clear, half_y - site.clear),
+        shift,
+        xp,
+    )
+    start = place_starts(site, hall, target, starts, site.present, xp)
+    along, half = between(mouth, half_x)
+    aside, thin = gap // 2 + THICKNESS // 2, THICKNESS // 2
+    wall = rows(((along, middle + aside, half, thin), (along, middle - aside, half, thin)), xp)
+    return Drawn(wall, np.ones(2, bool), start, target)
+
+
+ROW = ArenaLayout(
+    draw=draw_row,
+    uniforms=lambda robots, _: 3 + robots,
+    walls=lambda _: 2,
+    reads=("gap", "apart"),
 )

@@ -11,7 +11,6 @@ import numpy as np
 from swarmjax.task.layouts.site import (
     THICKNESS,
     ArenaLayout,
-    Demand,
     Drawn,
     Site,
     pick,
@@ -19,7 +18,6 @@ from swarmjax.task.layouts.site import (
 from swarmjax.task.placement import split
 
 Array = Any
-_PASSAGE = 0.20  # m, least free width: one robot can pass another that parks in the middle
 
 
 def edges(cells: int) -> np.ndarray:
@@ -114,16 +112,10 @@ def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -
     return xp.concatenate([xp.stack([x, y], axis=-1), halves], axis=-1).astype(xp.int32)
 
 
-def _least(demand: Demand) -> tuple[float, float]:
-    side = demand["cells"] * (_PASSAGE + THICKNESS / 4096)
-    return side, demand["side"]
-
-
 MAZE = ArenaLayout(
     draw=draw,
     uniforms=lambda robots, cells: 2 * cells * (cells - 1) + cells**2 + 4 * robots,
     walls=lambda cells: 2 * cells * (cells - 1),
     reads=("cells",),
-    least=_least,
     square=True,
 )

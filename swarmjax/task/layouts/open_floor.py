@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Demand, Drawn, Site, pick, points
+from swarmjax.task.layouts.site import MARGIN_UNITS, ArenaLayout, Drawn, Site, pick, points
 from swarmjax.task.placement import Gap, place, score_things, split
 
 Array = Any
@@ -18,9 +18,7 @@ _TURN = 5040  # directions around the circle; divisible by 2 to 10, by 12, 14, 1
 _ONE = 2**14  # scale of the sine table; times a radius of 2 m (2**13 units), it fits an int32
 _ANGLE = np.arange(_TURN) * (2.0 * math.pi / _TURN)
 _TABLE = np.round(_ONE * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)).astype(np.int32)
-_WALL = 0.07  # m, from the circle to the walls: a hull's radius of 0.045 m and some spare space
 _LATTICE = 40  # points along a side; they are 3 cm apart in an arena of 1.2 m
-_FILLING = 0.5  # largest share of the area for discs as wide as `apart`; random discs jam at 0.547
 
 
 def draw_circle(uniforms: Array, site: Site, xp: Any) -> Drawn:
@@ -49,17 +47,11 @@ def _on_circle(direction: Array, radius: Array, xp: Any) -> Array:
     return (xp.asarray(_TABLE)[direction] * radius + _ONE // 2) // _ONE
 
 
-def _least_circle(demand: Demand) -> tuple[float, float]:
-    side = 2 * (demand["radius"] + _WALL)
-    return side, side
-
-
 CIRCLE = ArenaLayout(
     draw=draw_circle,
     uniforms=lambda _, __: 1,
     walls=lambda _: 0,
     reads=("radius",),
-    least=_least_circle,
     square=True,
 )
 
@@ -89,17 +81,9 @@ def draw_crowd(uniforms: Array, site: Site, xp: Any) -> Drawn:
     return Drawn(xp.zeros((0, 4), xp.int32), np.zeros(0, bool), start, target)
 
 
-def _least_crowd(demand: Demand) -> tuple[float, float]:
-    disc = math.pi * (0.5 * demand["apart"]) ** 2
-    area = demand["robots"] * disc / _FILLING
-    side = math.sqrt(area) + 2 * 0.065 - demand["apart"]
-    return max(side, 0.4), area / demand["side"]
-
-
 CROWD = ArenaLayout(
     draw=draw_crowd,
     uniforms=lambda robots, _: 4 + 2 * robots,
     walls=lambda _: 0,
     reads=("apart",),
-    least=_least_crowd,
 )

@@ -1,6 +1,6 @@
 """Shared parts of layouts: arenas, walls, and areas for robots."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,9 +33,6 @@ class Numbers(NamedTuple):
 
 
 NUMBERS = Numbers._fields  # settings of a stage, m
-# Numbers of a stage that a layout must have room for, by key: the number of robots, the smallest
-# side and breadth, m, and the largest value of each number that the layout reads.
-Demand = Mapping[str, float]
 
 
 class Site(NamedTuple):
@@ -87,7 +84,6 @@ class ArenaLayout(NamedTuple):
         takes.
       walls: takes a number of cells (of a maze), and returns the largest number of walls.
       reads: those `NUMBERS` of a stage that the layout uses, or `cells`.
-      least: returns the smallest side and breadth with room for a demand, m.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
     """
@@ -96,7 +92,6 @@ class ArenaLayout(NamedTuple):
     uniforms: Callable[[int, int], int]
     walls: Callable[[int], int]
     reads: tuple[str, ...]
-    least: Callable[[Demand], tuple[float, float]]
     most_robots: int = 100
     square: bool = False
 
