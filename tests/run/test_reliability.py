@@ -148,9 +148,6 @@ def test_a_resume_that_is_killed_while_it_opens_its_files_loses_nothing(
     assert train.main([f"resume={run}"]) == 0
     assert _digest(run) == _digest(whole)
     assert _updates(run) == list(range(9))
-    summary = json.loads((run / "summary.json").read_text())
-    kept = json.loads((whole / "summary.json").read_text())
-    assert summary["transitions"] == kept["transitions"]
 
 
 @pytest.mark.slow
