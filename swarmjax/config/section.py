@@ -21,7 +21,7 @@ MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 # Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number by 0
 # if the number is nearer to 0 than `_SMALLEST`.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
-LAST_READER = "c5cd6da"  # the last commit that reads runs and policies with older keys
+LAST_READER = "8820a9f"  # the last commit that reads runs and policies with older keys
 
 
 class UnknownKeyError(ConfigError):

@@ -8,12 +8,12 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import check_options
 from swarmjax.extension import OwnCurriculum
 
-MODES = ("sequential", "mixed", "adaptive")
-_STEPWISE, _ADAPTIVE = MODES[:2], MODES[2:]
+PROMOTING = ("sequential", "mixed")  # modes that move from stage to stage
+MODES = (*PROMOTING, "adaptive")
 # The modes that read an option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
-    **dict.fromkeys(("threshold", "budget_share", "optimizer", "exploration"), ("mode", _STEPWISE)),
-    **dict.fromkeys(("score", "floor", "shares"), ("mode", _ADAPTIVE)),
+    **dict.fromkeys(("threshold", "budget_share", "optimizer", "exploration"), ("mode", PROMOTING)),
+    **dict.fromkeys(("score", "floor", "shares"), ("mode", ("adaptive",))),
 }
 
 

@@ -148,16 +148,18 @@ def _by_mjx(
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
     """Runs each cell at once in the training engine."""
-    from swarmjax.evaluate import engine_mjx  # it needs JAX
+    from swarmjax.evaluate import engine_mjx
+    from swarmjax.run import compile_cache  # these modules need JAX
 
     for config, cell in zip(configs, cells, strict=True):
         outcomes, sampled = [], config.action == "sampled"
-        world = engine_mjx.load(config, cell.largest_half, len(cell.episodes))
-        for _, trained in entrants:
-            outcomes.append(
-                engine_mjx.play(world, cell.levels, trained, config.step_limit, sampled=sampled)
-            )
-            report(len(cell.episodes))
+        with compile_cache.use():
+            world = engine_mjx.load(config, cell.largest_half, len(cell.episodes))
+            for _, trained in entrants:
+                outcomes.append(
+                    engine_mjx.play(world, cell.levels, trained, config.step_limit, sampled=sampled)
+                )
+                report(len(cell.episodes))
         yield outcomes, ways(config, cell.levels)
 
 

@@ -18,6 +18,7 @@ from swarmjax.curriculum.engine import Schedule
 from swarmjax.curriculum.log import log
 from swarmjax.run import (
     checkpoint,
+    compile_cache,
     directory,
     hosts,
     memory,
@@ -112,7 +113,8 @@ class Run:
           StoppedError: if a stop was requested before there was anything to save.
         """
         hosts.join(self.settings)
-        with hosts.lost_peers(), memory.refusal(self.settings), self._directory():
+        refusal = memory.refusal(self.settings)
+        with compile_cache.use(), hosts.lost_peers(), refusal, self._directory():
             self.load()
             if self.update < self.settings.updates:
                 self.compile()

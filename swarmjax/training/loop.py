@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum import engine as curricula
+from swarmjax.curriculum import engine
 from swarmjax.curriculum.engine import BY_BUDGET, BY_THRESHOLD, CurriculumState, Schedule
 from swarmjax.ppo import batch as batches
 from swarmjax.ppo.batch import Batch
@@ -60,7 +60,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     config = program.config
     start_key = jax.random.key(config.seed if seed is None else seed)
     run_key, learner_key, level_key = jax.random.split(start_key, 3)
-    curriculum = curricula.init(program.curriculum(schedule), schedule)
+    curriculum = engine.init(program.curriculum(schedule), schedule)
     starts = _draw(program, schedule, curriculum, level_key, waiting=1)
     learners = jax.vmap(program.ppo.init)(jax.random.split(learner_key, config.learners))
     return TrainState(learners, starts, curriculum, run_key, jnp.zeros((), jnp.int32))
@@ -117,7 +117,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
     loss = batches.value_loss(batch, ended.episodes > 0)
     success = config.curriculum.success
-    curriculum = curricula.observe(
+    curriculum = engine.observe(
         program.curriculum(schedule), schedule, success, before, ended, loss, state.update, shards
     )
     learners = carry_over(learners, program, before, curriculum)
@@ -162,7 +162,7 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    count = len(learners.normalizer.count)
+    count = program.config.learners
     if count > 1:  # learner i % before.met is copied to the place of learner i
         index = jnp.arange(count)
         new = (index >= before.met) & (index < after.met)
@@ -186,7 +186,7 @@ def _draw(
     """Draws `waiting` episodes for each arena of this device."""
     config, shards = program.config, program.shards
     choose_key = jax.random.fold_in(key, 1)
-    chosen = curricula.choose(
+    chosen = engine.choose(
         program.curriculum(schedule), curriculum, choose_key, (waiting, config.arenas)
     )
     following, cohort = jax.tree.map(partial(shards.local, axis=1), chosen)

@@ -1,11 +1,14 @@
 """Builds the compiled program of a run from its settings."""
 
 import math
+from functools import partial
 
 import jax
 import numpy as np
 
 from swarmjax import extension
+from swarmjax.curriculum import stages
+from swarmjax.curriculum.config import PROMOTING
 from swarmjax.curriculum.engine import NEVER, Schedule
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import PPO
@@ -33,10 +36,12 @@ def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) 
     rows = max(1, MAX_ROWS // config.seeds)
     if by_robot:
         rows = min(rows, episodes.rows_of_call(config))
+    own = extension.load(config.extensions).curricula
     return Program(
         config,
         world,
         load_ppo(config, world),
+        partial(stages.make, options=config.curriculum, own=own),
         by_robot=by_robot,
         waiting=config.waiting,
         rows=min(config.updates, rows),
@@ -102,7 +107,7 @@ def schedule(config: ProgramConfig) -> Schedule:
     options, before = config.curriculum, len(config.stage) - 1
     share = options.budget_share * config.updates / max(before, 1)
     deadline = [math.ceil(share * (i + 1)) for i in range(before)]
-    if options.mode not in ("sequential", "mixed"):
+    if options.mode not in PROMOTING:
         deadline = [NEVER] * before
     return Schedule(
         stages=task_stage.stack(config.stage, extension.load(config.extensions).levels),

@@ -5,6 +5,7 @@ with N the robots of an arena that one learner drives.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -13,8 +14,6 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax import extension
-from swarmjax.curriculum import stages as curricula
 from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, Next, Schedule
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
@@ -38,6 +37,7 @@ class Program[C: ProgramConfig]:
       config: its settings.
       world: the compiled environment.
       ppo: how the learners act and learn.
+      curriculum: makes the curriculum with the numbers of a schedule.
       by_robot: whether to report each episode robot by robot.
       waiting: episodes that are drawn for each arena before a rollout.
       rows: most updates of one call.
@@ -46,6 +46,7 @@ class Program[C: ProgramConfig]:
     config: C
     world: World
     ppo: PPO
+    curriculum: Callable[[Schedule], Curriculum]
     by_robot: bool = False
     waiting: int = 1
     rows: int = 1
@@ -53,12 +54,7 @@ class Program[C: ProgramConfig]:
     @property
     def shards(self) -> Shards:
         """How the arenas are spread over devices."""
-        return self.ppo.learning.shards
-
-    def curriculum(self, schedule: Schedule) -> Curriculum:
-        """Returns the curriculum with the numbers of a schedule."""
-        own = extension.load(self.config.extensions).curricula
-        return curricula.make(schedule, self.config.curriculum, own)
+        return Shards(self.config.arena_devices, self.config.stream_count)
 
 
 @struct.dataclass
@@ -173,12 +169,12 @@ def collect(
     Returns:
       The arenas, packed; the trajectory; the episodes that ended.
     """
-    waits = starts, _judge(program, learners, starts)
-    step = functools.partial(_step, program, learners, waits)
+    waiting = starts, _value(program, learners, starts)
+    step = functools.partial(_step, program, learners, waiting)
     unpack = functools.partial(physics.unpack, program.world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
     begun = jnp.zeros_like(arenas.clock)
-    carry = (arenas, _judge(program, learners, arenas), begun)
+    carry = (arenas, _value(program, learners, arenas), begun)
     steps = program.config.algo.rollout_length
     keys = jax.random.split(key, steps)
     carry, (trajectory, counts) = jax.lax.scan(step, carry, (keys, 1 + jnp.arange(steps)))
@@ -204,8 +200,8 @@ def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended
     return each(trajectory, first, ended.episodes > 0)
 
 
-class _Judged(NamedTuple):
-    """The critics' results for the current observations, [L, A, N, ...].
+class _Valued(NamedTuple):
+    """What the critics say of the current observations, [L, A, N, ...].
 
     Attributes:
       value: value of the observation.
@@ -225,47 +221,49 @@ _COUNTS = (
 )
 
 # Waiting episodes [W A], packed, and the critics' results for their first observations.
-_Waiting = tuple[Arena, _Judged]
+_Waiting = tuple[Arena, _Valued]
 _Counts = tuple[Array, Ended]  # counts [A, K]; the other results [A]
-_Carry = tuple[Arena, _Judged, Array]  # arenas, critics' results, episodes begun by each arena
+_Carry = tuple[Arena, _Valued, Array]  # arenas, critics' results, episodes begun by each arena
 
 
 def _step(
     program: Program,
     learners: LearnerState,
-    waits: _Waiting,
+    waiting: _Waiting,
     carry: _Carry,
-    now: tuple[Array, Array],
+    step: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
     """Runs one control step of all arenas; the first step of a rollout is 1."""
-    (arenas, judged, begun), (key, number) = carry, now
-    count = judged.value.shape[0]
-    mine = to_learners(arenas.observation, count)
-    noise = _noise(program.shards, key, (*mine.shape[:-1], drive.ACTION_SIZE))
+    (arenas, before, begun), (key, number) = carry, step
+    count = before.value.shape[0]
+    observation = to_learners(arenas.observation, count)
+    noise = _noise(program.shards, key, (*observation.shape[:-1], drive.ACTION_SIZE))
     acting = program.ppo.explore(learners, number * program.config.arenas)
     memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.actor)
-    action, log_prob, memory = jax.vmap(program.ppo.act)(acting, mine, noise, memory)
-    arenas, came = jax.vmap(functools.partial(env.step, program.world))(arenas, to_arenas(action))
-    recall = jax.tree.map(to_arenas, Recall(memory, judged.memory))
+    action, log_prob, memory = jax.vmap(program.ppo.act)(acting, observation, noise, memory)
+    arenas, timestep = jax.vmap(functools.partial(env.step, program.world))(
+        arenas, to_arenas(action)
+    )
+    recall = jax.tree.map(to_arenas, Recall(memory, before.memory))
     arenas = replace(arenas, recall=recall)
-    reached = _judge(program, learners, arenas)
-    ended = _ended(arenas, came, by_robot=program.by_robot)
-    starts, first = _next(waits, begun)
-    arenas = restart(arenas, starts, came.done)
-    over = jnp.broadcast_to(came.done[None, :, None], reached.value.shape)
+    after = _value(program, learners, arenas)
+    ended = _ended(arenas, timestep, by_robot=program.by_robot)
+    starts, first = _next(waiting, begun)
+    arenas = restart(arenas, starts, timestep.done)
+    over = jnp.broadcast_to(timestep.done[None, :, None], after.value.shape)
     transition = Trajectory(
-        observation=mine,
+        observation=observation,
         action=action,
         log_prob=log_prob,
-        value=judged.value,
-        next_value=reached.value,
-        reward=to_learners(came.reward, count),
-        terminated=to_learners(came.terminated, count),
-        truncated=to_learners(came.truncated, count),
-        valid=to_learners(came.valid, count),
-        state=judged.state,
+        value=before.value,
+        next_value=after.value,
+        reward=to_learners(timestep.reward, count),
+        terminated=to_learners(timestep.terminated, count),
+        truncated=to_learners(timestep.truncated, count),
+        valid=to_learners(timestep.valid, count),
+        state=before.state,
     )
-    carry = (arenas, _pick(over, first, reached), begun + came.done)
+    carry = (arenas, _pick(over, first, after), begun + timestep.done)
     return carry, (transition, _to_counts(ended))
 
 
@@ -276,27 +274,27 @@ def _noise(shards: Shards, key: Array, shape: tuple[int, ...]) -> Array:
     return shards.draw(key, lambda key: jax.random.normal(key, size), axis=1)
 
 
-def _next(waits: _Waiting, begun: Array) -> tuple[Arena, _Judged]:
+def _next(waiting: _Waiting, begun: Array) -> tuple[Arena, _Valued]:
     """Picks the next episode [A] of each arena, and the critics' results for it."""
-    (starts, judged), arenas = waits, begun.shape[0]
+    (starts, first), arenas = waiting, begun.shape[0]
     count = starts.cohort.shape[0] // arenas
     if count > 1:
         index = jnp.minimum(begun, count - 1) * arenas + jnp.arange(arenas)
         starts = jax.tree.map(lambda x: x[index], starts)
-        judged = jax.tree.map(lambda x: x[:, index], judged)
-    return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), judged
+        first = jax.tree.map(lambda x: x[:, index], first)
+    return replace(starts, cohort=jnp.where(begun < count, starts.cohort, UNCOUNTED)), first
 
 
-def _judge(program: Program, learners: LearnerState, arenas: Arena) -> _Judged:
-    """Lets critics judge the current observations of arenas [A]."""
+def _value(program: Program, learners: LearnerState, arenas: Arena) -> _Valued:
+    """Values the current observations of arenas [A] by the critics."""
     count, state = jax.tree.leaves(learners)[0].shape[0], ()
     memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.critic)
     if program.ppo.sizes.state:
         around = jax.vmap(functools.partial(env.look_around, program.world))(arenas)
         state = to_learners(around, count)
     seen = to_learners(arenas.observation, count)
-    value, after = jax.vmap(program.ppo.value)(learners, seen, state, memory)
-    return _Judged(value, after, state)
+    value, memory = jax.vmap(program.ppo.value)(learners, seen, state, memory)
+    return _Valued(value, memory, state)
 
 
 def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
@@ -324,9 +322,9 @@ def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
     return jax.tree.map(pick, yes, no)
 
 
-def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
+def _ended(arenas: Arena, timestep: env.TimeStep, *, by_robot: bool) -> Ended:
     """Counts the episodes that ended in this step, [A], and sums their results."""
-    done, episode = came.done, arenas.episode
+    done, episode = timestep.done, arenas.episode
     present = arenas.level.present
     targets, reached = jnp.sum(present, axis=-1), jnp.sum(present & arenas.arrived, axis=-1)
 
@@ -345,7 +343,7 @@ def _ended(arenas: Arena, came: env.TimeStep, *, by_robot: bool) -> Ended:
         sensed=mine(jnp.sum(episode.sensed, axis=-1)),
         contacts=mine(jnp.sum(episode.contacts, axis=-2)),
         reward=mine(jnp.sum(episode.reward, axis=-1)),
-        broken=(~came.sound).astype(jnp.int32),
+        broken=(~timestep.sound).astype(jnp.int32),
         level=None if arenas.seed is None else mine(arenas.seed),
         robots=jax.tree.map(mine, episodes.robots(arenas)) if by_robot else None,
     )

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from sentences import refusal
 
-from swarmjax.curriculum import engine
+from swarmjax import extension
+from swarmjax.curriculum import engine, stages
 from swarmjax.curriculum.engine import REWEIGHED, Curriculum, Schedule
 from swarmjax.run.load_settings import load_train
 from swarmjax.task.episode import Ended
@@ -24,8 +25,8 @@ def _load(path: Path, body: str, name: str) -> tuple[Curriculum, Schedule]:
     config = load_train(["stage=curriculum", *words])
     assert list(config.pieces["curriculum"]) == [name]
     schedule = programs.schedule(config)
-    program = programs.Program(config, world=None, ppo=None)  # type: ignore[arg-type]  # not used
-    return program.curriculum(schedule), schedule
+    own = extension.load(config.extensions).curricula
+    return stages.make(schedule, config.curriculum, own), schedule
 
 
 def test_the_curriculum_of_the_guide(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def test_a_file_of_an_older_version_names_the_last_commit_that_reads_it() -> Non
     meta = policies.meta()
     meta["realism"]["dropout"] = 0.1
     assert refusal(trained_settings.trained, meta, "p.npz") == (
-        "p.npz: meta.realism.dropout is not a key: if an older version wrote it, c5cd6da is the "
+        "p.npz: meta.realism.dropout is not a key: if an older version wrote it, 8820a9f is the "
         "last commit that reads it."
     )
 

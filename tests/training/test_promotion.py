@@ -70,7 +70,7 @@ def _promote(
 ) -> LearnerState:
     chosen = replace(config, curriculum=CurriculumConfig(mode="sequential", **options))
     nowhere: Any = None  # nothing is simulated
-    program = Program(chosen, nowhere, learners.ppo(chosen.algo, Sizes(OBSERVED, 2)))
+    program = Program(chosen, nowhere, learners.ppo(chosen.algo, Sizes(OBSERVED, 2)), nowhere)
     schedule = programs.schedule(chosen)
     state = engine.init(stages.make(schedule, chosen.curriculum), schedule)
     reason = jnp.int32(engine.BY_THRESHOLD if promoted else engine.STAYED)
