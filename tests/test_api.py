@@ -123,20 +123,6 @@ def test_poses_are_where_the_level_starts(env: Swarm, states: list[SwarmState]) 
     np.testing.assert_allclose(env.pose(states[0]), states[0].arenas.level.start, atol=1e-6)
 
 
-def test_a_callback_sees_every_update_and_stops_the_run(tmp_path: Path) -> None:
-    seen: list[int] = []
-
-    def stop(row: dict) -> bool:
-        seen.append(row["update"])
-        return row["update"] == 3
-
-    result = swarmjax.train_policy(TINY | {"run.dir": tmp_path / "run"}, on_update=stop)
-    assert seen == [row["update"] for row in result.metrics] == [0, 1, 2, 3]
-    assert result.run == tmp_path / "run"
-    assert result.policy.digest == swarmjax.load_policy(result.run / "policy.npz").digest
-    assert result.policy.meta["update"] == 4
-
-
 @pytest.mark.slow
 def test_every_seed_has_its_policy(tmp_path: Path) -> None:
     settings = TINY | {"run.dir": tmp_path / "run", "seeds": 2, "budget": 16}

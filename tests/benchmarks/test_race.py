@@ -108,6 +108,7 @@ def test_seconds_to_a_share() -> None:
     assert race.seconds_to(course) == {"seconds_to_0.90": 2.0, "seconds_to_0.95": None}
 
 
+@pytest.mark.slow
 def test_our_course_has_a_point_for_each_judgement(
     tiny_config: TrainConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -182,7 +182,7 @@ def test_the_guess_of_the_state_is_charged_by_its_squared_error(
     count = jnp.float32(14.0)
     loss, metrics = _loss(params, minibatch, nets, config, count)
     monkeypatch.setattr(gradients, "GUESS_COST", 0.0)
-    free, _ = _loss(params, minibatch, nets, config, count)
+    free, _ = ppo_loss(params, minibatch, nets, config, count)  # traced with the new cost
     flat = traverse_util.flatten_dict(params["actor"], sep="/")
     layers = {name: np.asarray(x, np.float64) for name, x in flat.items()}
     hidden = np.tanh(

@@ -33,7 +33,7 @@ TINY = {
     "arenas": 16,
     "algo": {"rollout_length": 4, "num_minibatches": 2, "epochs": 1, "hidden_sizes": [8]},
     "task.step_limit": 8,
-    "budget": 16 * 4 * 6,
+    "budget": 16 * 4 * 8,
     "run.chunk": 2,
 }
 HAS_WANDB = getattr(importlib.util.find_spec("wandb"), "origin", None) is not None
@@ -73,14 +73,24 @@ class Told:
 
     def __init__(self, run: Path) -> None:
         self.listening, self.broken = Listening(), Broken()
+        self.seen: list[int] = []
         more = {"run.wandb": "swarms"} if HAS_WANDB else {}
         offline = pytest.MonkeyPatch.context()
         with offline as patch, contextlib.redirect_stderr(io.StringIO()) as said:
             patch.setenv("WANDB_MODE", "offline")
-            swarmjax.train_policy(TINY | more | {"run.dir": run}, log=[self.broken, self.listening])
+            self.result = swarmjax.train_policy(
+                TINY | more | {"run.dir": run},
+                log=[self.broken, self.listening],
+                on_update=self._stop,
+            )
         self.said = said.getvalue()
         self.run = run
         self.rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+    def _stop(self, row: dict) -> bool:
+        """Stops the run after its sixth update; its budget is eight."""
+        self.seen.append(row["update"])
+        return row["update"] == 5
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +127,14 @@ def _scalars(folder: Path) -> list[tuple[int, dict[str, float]]]:
         for event in _events(file)
         if event.summary.value
     ]
+
+
+def test_a_callback_sees_every_update_and_stops_the_run(told: Told) -> None:
+    result = told.result
+    assert told.seen == [row["update"] for row in result.metrics] == [*range(6)]
+    assert result.run == told.run
+    assert result.policy.digest == swarmjax.load_policy(told.run / "policy.npz").digest
+    assert result.policy.meta["update"] == 6
 
 
 def test_tensorboard_has_the_numbers_of_the_record(told: Told) -> None:
@@ -184,7 +202,7 @@ def test_a_logger_that_raises_loses_itself_and_not_the_run(told: Told) -> None:
 @pytest.mark.slow
 def test_a_run_that_goes_on_tells_what_comes_after_its_checkpoint(told: Told) -> None:
     log = Listening()
-    more = {"budget": 16 * 4 * 8, "run.tensorboard": False, "run.wandb": None}
+    more = {"run.tensorboard": False, "run.wandb": None}
     swarmjax.train_policy({"resume": told.run} | more, log=[log])
     calls = [found for what, found, _ in log.told if what == "write"]
     assert [row["update"] for rows, _ in calls for row in rows] == [6, 7]
