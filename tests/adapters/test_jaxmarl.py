@@ -55,6 +55,7 @@ def test_observations_and_rewards_are_those_of_the_course(
                 assert_close(reward[agent][arena], arena_course.came.reward[t, 0, i])
 
 
+@pytest.mark.slow
 def test_who_arrives_is_done_until_all_are(steps: list) -> None:
     dones = {name: [bool(step[3][name][0]) for step in steps] for name in [*AGENTS, "__all__"]}
     early, late = [False] * ARRIVED, [False] * (LIMIT - 1)
@@ -62,6 +63,7 @@ def test_who_arrives_is_done_until_all_are(steps: list) -> None:
     assert dones["agent_1"] == dones["__all__"] == [*late, True, False]
 
 
+@pytest.mark.slow
 def test_infos_are_arrays_over_agents(steps: list, arena_course: Course) -> None:
     for t, (*_, info) in enumerate(steps):
         assert sorted(info) == ["terminated", "truncated", "valid"]
@@ -70,6 +72,7 @@ def test_infos_are_arrays_over_agents(steps: list, arena_course: Course) -> None
             np.testing.assert_array_equal(found, [expected, expected])
 
 
+@pytest.mark.slow
 def test_who_has_arrived_has_no_actions(env: SwarmMultiAgentEnv, steps: list) -> None:
     free = jax.vmap(env.get_avail_actions)
     before, after = free(steps[ARRIVED - 1][1]), free(steps[ARRIVED][1])
@@ -79,6 +82,7 @@ def test_who_has_arrived_has_no_actions(env: SwarmMultiAgentEnv, steps: list) ->
     assert after["agent_1"].shape == (2, 2)
 
 
+@pytest.mark.slow
 def test_step_env_sees_the_last_of_the_episode(
     env: SwarmMultiAgentEnv, steps: list, arena_course: Course
 ) -> None:

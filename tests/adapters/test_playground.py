@@ -43,6 +43,7 @@ def test_what_playground_asks(env: SwarmMjxEnv) -> None:
     assert env.mj_model.nbody > 2
 
 
+@pytest.mark.slow
 def test_it_follows_the_course(states: list, arena_course: Course) -> None:
     came = arena_course.came
     for t, state in enumerate(states[1:]):
@@ -52,6 +53,7 @@ def test_it_follows_the_course(states: list, arena_course: Course) -> None:
         assert state.done == 0.0  # a robot times out, and only the wrapper reports that
 
 
+@pytest.mark.slow
 def test_done_says_that_all_have_arrived(env: SwarmMjxEnv, states: list) -> None:
     state = states[50]
     arenas = state.data.arenas
@@ -76,6 +78,7 @@ def test_playgrounds_wrapper_ends_episodes_and_draws_new_levels(wrapped: Any) ->
     np.testing.assert_array_equal(state.obs, state.data.observation.reshape(3, -1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("action", [jnp.zeros(2), jnp.zeros(4, int)])
 def test_wrong_actions_are_refused(env: SwarmMjxEnv, states: list, action: Any) -> None:
     with pytest.raises(ValueError, match=r"^action "):

@@ -372,10 +372,6 @@ def wrong(tmp_path: Path) -> None:
             "shared policy, or a stage of 1 to 3.",
         ),
         (
-            ["policy=three.npz", "suite=swarm"],
-            "three.npz holds a network for each of 3 robots, but stage r4 has 4: ",
-        ),
-        (
             ["policy=other.npz", "stage=s1"],
             "other.npz was trained on observations that differ from this robot's: its "
             f"meta.observation.names is {observation.NAMES[0]}, ",

@@ -174,6 +174,7 @@ def test_actor_learns_the_best_action() -> None:
     np.testing.assert_allclose(_modes(state, 0.0), [0.5], atol=0.02)
 
 
+@pytest.mark.slow
 def test_actor_learns_the_best_action_of_each_observation() -> None:
     state = _solve(
         Probe(

@@ -372,6 +372,7 @@ def _spoil(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     monkeypatch.setattr(runs, "compile_chunk", compile_and_spoil)
 
 
+@pytest.mark.slow
 def test_a_run_that_diverges_ends_and_keeps_its_last_sound_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -384,6 +385,7 @@ def test_a_run_that_diverges_ends_and_keeps_its_last_sound_checkpoint(
     assert checkpoint.find(tmp_path).update == 4
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_before_it_has_diverged_names_the_last_sound_update(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

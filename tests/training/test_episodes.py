@@ -159,6 +159,7 @@ def test_sums_over_episodes_are_the_metrics(whole: Path) -> None:
     assert any(any(row["sensed"]) for row in rows)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_writes_the_same_episodes(
     whole: Path, train_for: Train, tmp_path: Path
 ) -> None:
