@@ -39,7 +39,9 @@ def _levels(stage: StageConfig, count: int) -> list[Level]:
     return [engine_c.draw_level(arrays, spacing, 3, number) for number in range(count)]
 
 
-@pytest.mark.parametrize("name", ["trap", "door", "maze"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(each, marks=pytest.mark.slow) for each in ("trap", "door")), "maze"]
+)
 def test_rays_meet_walls_where_mujoco_meets_them(tmp_path: Path, name: str) -> None:
     stage = _stage(name)
     judge = _judge(tmp_path, stage)

@@ -135,9 +135,17 @@ def _assert_close(found: Any, expected: Any) -> None:
             {"hidden_sizes": (64, 64)}, Launch(32, 3, 4), 200, 140.0, marks=pytest.mark.slow
         ),
         ({"hidden_sizes": (32,), "activation": "relu"}, Launch(16, 4, 4), 70, 140.0),
-        ({"hidden_sizes": (16, 32, 16), "activation": "swish"}, Launch(16, 100, 4), 64, 60.0),
+        pytest.param(
+            {"hidden_sizes": (16, 32, 16), "activation": "swish"},
+            Launch(16, 100, 4),
+            64,
+            60.0,
+            marks=pytest.mark.slow,
+        ),
         ({"exploration": "scheduled"}, Launch(64, 1, 4), 65, 40.0),
-        ({"mean_activation": "tanh"}, Launch(32, 2, 4), 40, 30.0),
+        pytest.param(
+            {"mean_activation": "tanh"}, Launch(32, 2, 4), 40, 30.0, marks=pytest.mark.slow
+        ),
         # With 0.25 expected valid samples, the sums are divided by 1.
         ({"clip_epsilon": 0.3}, Launch(32, 2, 4), 9, 0.25),
     ],
