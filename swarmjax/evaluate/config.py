@@ -11,13 +11,16 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.stage_config import StageConfig
 
+# Friction of the judged robots' hulls on hulls, boxes and walls: `coulombFriction` of Webots'
+# ContactProperties is 1 by default.
+HULL_FRICTION = 1.0
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
 STEPS = 1500  # control steps of an episode by default; Table 1
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
 # Values that `trained_settings.load` takes from the policies.
 AS_TRAINED = {
     "stage": "its last stage",
-    "robot": "as trained, on wheels",
+    "robot": "as trained, on wheels and with hulls of friction 1",
     "task": "as trained",
     "realism": "as trained",
 }
@@ -30,7 +33,9 @@ class JudgeConfig(Section):
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     stage: StageConfig
-    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
+    robot: RobotConfig = field(
+        default_factory=lambda: RobotConfig(body="wheeled", hull_friction=HULL_FRICTION)
+    )
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = setting(
         None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"

@@ -1,8 +1,8 @@
 """The robot and the task that a policy was trained with, from its file.
 
 Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
-the command line sets them. The judge's body does not come from the file. By default this body has
-wheels.
+the command line sets them. The judge's body and the friction of hulls do not come from the file. By
+default the body has wheels and hulls rub as in Webots, so that all policies are judged alike.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from swarmjax import policy_file
 from swarmjax.config import ConfigError, Section, build, files, inherit
 from swarmjax.config.section import build_stored
+from swarmjax.evaluate.config import HULL_FRICTION
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
@@ -21,7 +22,8 @@ from swarmjax.task.config import TaskConfig, describe
 
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
-BODY = "wheeled"  # a judge's body, unless the command line or a robot file names another
+# What a judge's robot has unless the command line or a robot file says otherwise.
+_JUDGED = {"body": "wheeled", "hull_friction": HULL_FRICTION}
 _SHOWN = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 
 
@@ -112,15 +114,13 @@ def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
 
 
 def _words(cls: type[Section], training: Trained, typed: Sequence[str]) -> list[str]:
-    """Converts the training's settings to arguments.
-
-    The judge's body keeps its wheels if a robot file names no body.
-    """
+    """Converts the training's settings to arguments."""
     choice = files.parse(cls, typed).get("robot")
-    own = {"body": BODY} if choice is None else files.read_choice("robot", choice)
+    own = {} if choice is None else files.read_choice("robot", choice)
+    judged = _JUDGED.keys() - own.get("robot", own).keys()
     return [
-        *([] if "body" in own.get("robot", own) else [f"robot.body={BODY}"]),
-        *inherit.group_words(cls, "robot", training.robot, typed, skip=["body"]),
+        *(f"robot.{key}={_JUDGED[key]}" for key in sorted(judged)),
+        *inherit.group_words(cls, "robot", training.robot, typed, skip=_JUDGED),
         *inherit.group_words(cls, "task", training.task, typed),
         *inherit.preset_words(cls, "realism", training.realism, typed),
     ]

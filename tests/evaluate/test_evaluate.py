@@ -214,7 +214,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
         "substeps": 4,  # of the wheeled robot in this engine
         "pooled": None,
     }
-    assert result["robot"] == _plain(RobotConfig(body="wheeled", mass=0.2))
+    assert result["robot"] == _plain(RobotConfig(body="wheeled", hull_friction=1.0, mass=0.2))
     assert result["task"] == _plain(TaskConfig(target_radius=0.06))
     assert result["cells"][0]["realism"] == _plain(RealismConfig(speed_noise=0.01))
     assert result["policies"] == [{"path": str(path), "digest": policy.load(path).digest}]

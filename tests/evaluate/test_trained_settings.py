@@ -96,7 +96,9 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
 
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = trained_settings.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
-    assert said.startswith("as trained but for task.sensor_range=0.05: hull 0.044 m, infrared to ")
+    assert said.startswith(
+        "as trained but for task.sensor_range=0.05: hull 0.044 m of friction 1, infrared to "
+    )
     assert said.endswith(
         "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3"
     )
@@ -109,6 +111,18 @@ def test_the_first_line_does_not_take_a_file_of_realism_for_a_preset(tmp_path: P
     settings, said = trained_settings.load(EvaluateConfig, [word])
     assert settings.realism.mass == (0.1, 0.2)
     assert "realism custom" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "friction"),
+    [((), 1.0), (("robot=planar",), 1.0), (("robot.hull_friction=0.5",), 0.5)],
+)
+def test_hulls_rub_as_in_webots_whatever_the_training(
+    words: tuple[str, ...], friction: float, tmp_path: Path
+) -> None:
+    both = [_policy(tmp_path / f"{x}.npz", f"robot.hull_friction={x}") for x in (0, 2)]
+    names = ",".join(word.partition("=")[2] for word in both)
+    assert _load(f"policy={names}", *words).robot.hull_friction == friction
 
 
 def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> None:
