@@ -1,5 +1,6 @@
 """Builds reproductions of the paper whose numbers are known."""
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 
 from swarmjax.config import to_dict
 from swarmjax.reproduce.config import ARMS, ReproduceConfig
-from swarmjax.reproduce.rows import EXPANDED, JUDGED, LAST, Reproduction, RunLog
+from swarmjax.reproduce.rows import ACTIONS, EXPANDED, JUDGED, LAST, Reproduction, RunLog
 
 SEEDS = (0, 1, 2)
 VERSIONS = {"jax": "0.11.2"}
@@ -40,10 +41,10 @@ def episode(number: int, **given: Any) -> dict[str, Any]:
     } | given
 
 
-def row(arm: str, seed: int, stage: str, **given: Any) -> dict[str, Any]:
+def row(arm: str, seed: int, stage: str, action: str = "sampled", **given: Any) -> dict[str, Any]:
     """Returns a row of the evaluation."""
     shares = {"targets_reached": 0.9, "all_reached": 0.6, "sensed_share": 0.1}
-    where = {"arm": arm, "seed": seed, "stage": stage}
+    where = {"arm": arm, "seed": seed, "stage": stage, "action": action}
     return where | shares | {"contacts_per_robot": 1.5} | given
 
 
@@ -56,7 +57,7 @@ def write(
     """Writes a directory in which the arms in `logs` have finished."""
     out.mkdir(parents=True, exist_ok=True)
     settings = to_dict(ReproduceConfig(seeds=seeds))
-    facts = {"format": 3, "settings": settings, "versions": VERSIONS}
+    facts = {"format": 4, "settings": settings, "versions": VERSIONS}
     (out / "reproduce.json").write_text(json.dumps(facts))
     for arm, episodes in logs.items():
         (out / arm).mkdir(exist_ok=True)
@@ -64,9 +65,9 @@ def write(
         (out / arm / "episodes.jsonl").write_text(lines)
         (out / arm / "summary.json").write_text(json.dumps(SUMMARY))
     if judged is None:
-        stages = (LAST, EXPANDED)
-        judged = [row(arm, seed, stage) for arm in logs for seed in SEEDS for stage in stages]
-    text = json.dumps({"format": 3, "rows": list(judged)})
+        every = itertools.product(logs, SEEDS, (LAST, EXPANDED), ACTIONS)
+        judged = [row(*each) for each in every]
+    text = json.dumps({"format": 4, "rows": list(judged)})
     (out / "evaluation.json").write_text(text)
     return out
 
@@ -112,11 +113,14 @@ def log(successes: Sequence[bool], *, every: int = 100, **given: Any) -> RunLog:
 
 def reproduction(
     logs: Mapping[str, Sequence[RunLog]] | None = None,
-    judged: Mapping[tuple[str, str], Mapping[str, float]] | None = None,
+    judged: Mapping[tuple[str, ...], Mapping[str, float]] | None = None,
 ) -> Reproduction:
-    """Returns a reproduction in which every measure that is not given is 0 for all seeds."""
+    """Returns a reproduction in which every measure that is not given is 0 for all seeds.
+
+    The keys of `judged` are arm, stage and perhaps the kind of action; without it, both kinds.
+    """
     logs, judged = logs or {}, judged or {}
-    arms = [*logs, *(arm for arm, _ in judged if arm not in logs)]
+    arms = [*logs, *dict.fromkeys(arm for arm, *_ in judged if arm not in logs)]
     zero = dict.fromkeys(JUDGED, 0.0)
     return Reproduction(
         settings=ReproduceConfig(seeds=len(SEEDS)),
@@ -124,11 +128,16 @@ def reproduction(
         summaries=dict.fromkeys(arms, SUMMARY),
         logs={arm: tuple(logs.get(arm, [log([True] * 30)] * len(SEEDS))) for arm in arms},
         judged={
-            (arm, stage): {
+            (arm, stage, action): {
                 key: np.full(len(SEEDS), value)
-                for key, value in (zero | dict(judged.get((arm, stage), {}))).items()
+                for key, value in (
+                    zero
+                    | dict(judged.get((arm, stage), {}))
+                    | dict(judged.get((arm, stage, action), {}))
+                ).items()
             }
             for arm in arms
             for stage in (LAST, EXPANDED)
+            for action in ACTIONS
         },
     )

@@ -288,7 +288,7 @@ def observe(
       The state for the next update.
     """
     counted = count(state.cohorts, ended, shards)
-    judged, verdict = judge(counted, schedule.cohort_updates, success)
+    judged, verdict = conclude(counted, schedule.cohort_updates, success)
     every, loss = jax.tree.map(partial(shards.gather, axis=1), (ended, value_loss))
     outcomes = CurriculumOutcomes(every, loss, verdict, update)
     own = curriculum.observe(state.own, outcomes)
@@ -337,7 +337,7 @@ def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
     )
 
 
-def judge(
+def conclude(
     cohorts: Cohorts, updates: Array | np.int32, success: Success
 ) -> tuple[Cohorts, CohortVerdict]:
     """Ends an update; if a cohort is over, records the one before.

@@ -6,7 +6,7 @@ saves everything computed so far. `resume=DIR` continues.
 Examples:
   # all arms, ten seeds each: hours
   python -m swarmjax.reproduce
-  # a first look, in minutes
+  # a first look, in minutes, without verdicts
   python -m swarmjax.reproduce seeds=3 budget=100000
   # two arms
   python -m swarmjax.reproduce 'arms=[curriculum,baseline]'
@@ -16,6 +16,7 @@ Examples:
   python -m swarmjax.reproduce resume=runs/paper
 """
 
+import itertools
 import json
 import sys
 import time
@@ -38,7 +39,7 @@ from swarmjax.reproduce import arms, judge, page
 from swarmjax.reproduce import rows as reproduce_rows
 from swarmjax.reproduce.config import ReproduceConfig
 from swarmjax.reproduce.judge import Task
-from swarmjax.reproduce.rows import EVALUATION, EXPANDED, FACTS, FORMAT, LAST
+from swarmjax.reproduce.rows import ACTIONS, EVALUATION, EXPANDED, FACTS, FORMAT, LAST
 from swarmjax.run.checkpoint import CheckpointError
 from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY
@@ -106,13 +107,13 @@ def _write(path: Path, content: Mapping[str, Any]) -> None:
 def _judge(out: Path, given: ReproduceConfig) -> None:
     """Judges the policies that have not been judged yet."""
     rows = reproduce_rows.read_rows(out)
-    known = {(row["arm"], row["seed"], row["stage"]) for row in rows}
+    known = {(row["arm"], row["seed"], row["stage"], row["action"]) for row in rows}
+    done = reproduce_rows.summaries(out)
+    every = itertools.product(done, range(given.seeds), (LAST, EXPANDED), ACTIONS)
     tasks = [
-        Task(arm, seed, out / arm / POLICY.replace(".", f"-seed{seed}."), stage)
-        for arm in reproduce_rows.summaries(out)
-        for seed in range(given.seeds)
-        for stage in (LAST, EXPANDED)
-        if (arm, seed, stage) not in known
+        Task(arm, seed, out / arm / POLICY.replace(".", f"-seed{seed}."), stage, action)
+        for arm, seed, stage, action in every
+        if (arm, seed, stage, action) not in known
     ]
     progress = Progress(console=Console(stderr=True), transient=True)
     progress.disable = not progress.console.is_terminal

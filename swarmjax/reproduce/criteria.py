@@ -14,6 +14,9 @@ from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 type Criterion = Callable[..., tuple[bool | None, str]]
 
 ABOUT = 0.5  # "approximately": within this share of the number
+# A difference is found with a probability of 0.8 if it is (1.96 + 0.84) standard errors from 0. The
+# interval is 2 * 1.96 of them wide.
+_POWER = (1.96 + 0.84) / (2 * 1.96)
 _ROUNDING = 1e-9  # rounding error of a mean: the mean of 0.95, 0.95 and 0.95 is less than 0.95
 
 
@@ -54,7 +57,11 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
     both = " against ".join(unit.value(float(iqm(each))) for each in (ours, theirs))
-    return _sign(more.low, more.high), f"{both}, difference {unit.difference(more)}"
+    found = unit.value(_POWER * (more.high - more.low)).removesuffix(unit.suffix)
+    text = f"{both}, difference {unit.difference(more)}"
+    return _sign(
+        more.low, more.high
+    ), f"{text}; {found}{unit.apart} would be found in 8 of 10 studies"
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
@@ -66,7 +73,9 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
+    found = NUMBER.value(min(1.0, 0.5 + _POWER * (chance.high - chance.low)))
     text = f"{both}, probability of being earlier {NUMBER.interval(chance)}"
+    text += f"; {found} would be found in 8 of 10 studies"
     return _sign(chance.low - 0.5, chance.high - 0.5), text
 
 

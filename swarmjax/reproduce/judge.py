@@ -1,7 +1,8 @@
 """Judges the policies of a reproduction in MuJoCo's C engine. No JAX.
 
-Every policy drives by its mean action on the last stage and in the 1.5 m arena. The levels differ
-only in their sensor noise.
+Every policy drives on the last stage and in the 1.5 m arena, by sampled actions and by its mean
+action. PPO-PyTorch, which the paper used, tests by sampled actions. The levels differ only in their
+sensor noise.
 """
 
 from pathlib import Path
@@ -12,20 +13,22 @@ from swarmjax.config import build
 from swarmjax.evaluate import cells, engine_c
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.report.rows import Row
+from swarmjax.reproduce.rows import Action
 from swarmjax.run.load_settings import from_stored
 from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig
 
-EPISODES = 20  # on each stage
+EPISODES = 20  # on each stage, of either kind of action
 
 
 class Task(NamedTuple):
-    """A policy to judge on a stage."""
+    """A policy to judge on a stage, by actions of one kind."""
 
     arm: str
     seed: int
     path: Path
     stage: str
+    action: Action
 
 
 def judge(task: Task) -> Row:
@@ -43,7 +46,7 @@ def judge(task: Task) -> Row:
         robot=config.robot,
         task=config.task,
         realism=config.realism,
-        action="mean",
+        action=task.action,
         steps=config.task.step_limit,
         episodes=EPISODES,
     )
@@ -53,6 +56,7 @@ def judge(task: Task) -> Row:
         "arm": task.arm,
         "seed": task.seed,
         "stage": task.stage,
+        "action": task.action,
         "targets_reached": float(outcome.arrived.mean()),
         "all_reached": float(outcome.arrived.all(axis=-1).mean()),
         "sensed_share": float(outcome.sensed.sum() / outcome.moving.sum()),

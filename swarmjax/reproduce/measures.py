@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from swarmjax.evaluate.statistics import Interval
-from swarmjax.reproduce.rows import Reproduction, RunLog
+from swarmjax.reproduce.rows import Action, Reproduction, RunLog
 
 WINDOW = 20  # episodes of a rolling mean: "an averaging window of 20 values" (Figure 7)
 STEADY = 0.8  # share of successes in a steady window; the same share promotes from a stage
@@ -158,9 +158,11 @@ def late(data: Reproduction, arm: str, *, of: Measure, stage: str) -> np.ndarray
     return np.array([each[-1] if len(each) else np.nan for each in means])
 
 
-def judged(data: Reproduction, arm: str, *, key: str, stage: str) -> np.ndarray:
-    """Takes a result [N] of the final policies on a stage, with their mean actions."""
-    return data.judged[arm, stage][key]
+def judged(
+    data: Reproduction, arm: str, *, key: str, stage: str, action: Action = "sampled"
+) -> np.ndarray:
+    """Takes a result [N] of the final policies on a stage."""
+    return data.judged[arm, stage, action][key]
 
 
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:

@@ -13,6 +13,7 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import builder
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.config import BUDGET, FINE_TUNE
 from swarmjax.reproduce.measures import FINAL, PLACE, Unit
 from swarmjax.reproduce.rows import ARMS, LAST, MODERN, PAIR, Reproduction
 
@@ -74,14 +75,16 @@ def _page(
         lacking=data.lacking(ARMS),
         verdicts=verdicts,
         counts=", ".join(f"{outcomes.count(name)} {name}" for name in _OUTCOMES),
+        paper_budget=BUDGET,
+        paper_fine_tune=FINE_TUNE,
         held=claims.HELD,
         last=LAST,
         figures=figures,
         lacks=lacks,
-        final_heads=("arm", "on", *(label for label, _ in FINAL.values())),
+        final_heads=("arm", "on", "actions", *(label for label, _ in FINAL.values())),
         final=[
-            (arm, on, *(_mean(values[key], unit) for key, (_, unit) in FINAL.items()))
-            for (arm, on), values in data.judged.items()
+            (*where, *(_mean(values[key], unit) for key, (_, unit) in FINAL.items()))
+            for where, values in data.judged.items()
         ],
         window=measures.WINDOW,
         steady_share=100 * measures.STEADY,

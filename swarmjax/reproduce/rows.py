@@ -5,9 +5,11 @@ unfinished arm is left out, and the report names each figure that lacks it. If a
 an episode log, a seed or its evaluation, an error names the file and the arm.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,9 +21,11 @@ from swarmjax.run.directory import SUMMARY
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
-FORMAT = 3  # of both files
-_LAST_READER = "d8b3078"  # the last commit that reads format 2
+FORMAT = 4  # of both files
+_LAST_READER = "8820a9f"  # the last commit that reads format 3
 LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
+Action = Literal["sampled", "mean"]
+ACTIONS: tuple[Action, ...] = get_args(Action)
 PAIR = ("curriculum", "baseline")
 TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
@@ -85,14 +89,14 @@ class Reproduction:
       versions: versions of the software that computed it, by name.
       summaries: `summary.json` of each finished arm.
       logs: N logs of each finished arm.
-      judged: [N] values by finished arm and stage, for each name in `JUDGED`.
+      judged: [N] values by finished arm, stage and kind of action, for each name in `JUDGED`.
     """
 
     settings: ReproduceConfig
     versions: Row
     summaries: dict[str, Row]
     logs: dict[str, tuple[RunLog, ...]]
-    judged: dict[tuple[str, str], dict[str, np.ndarray]]
+    judged: dict[tuple[str, str, Action], dict[str, np.ndarray]]
 
     @property
     def seeds(self) -> range:
@@ -173,7 +177,7 @@ def read_rows(out: Path) -> list[Row]:
     for number, row in enumerate(rows, 1):
         where = f"{path}, row {number},"
         report_rows.check(row, ("seed",), report_rows.WHOLE, where)
-        report_rows.check(row, ("arm", "stage"), report_rows.NAME, where)
+        report_rows.check(row, ("arm", "stage", "action"), report_rows.NAME, where)
         report_rows.check(row, JUDGED, report_rows.NUMBER, where)
     return rows
 
@@ -184,7 +188,7 @@ def _read_object(path: Path) -> Row:
     if content.get("format") != FORMAT:
         raise ConfigError(
             f"{path} has format {content.get('format')!r}, but this version reads only format "
-            f"{FORMAT}; commit {_LAST_READER} was the last to read format 2."
+            f"{FORMAT}; commit {_LAST_READER} was the last to read format 3."
         )
     return content
 
@@ -227,16 +231,18 @@ def _log(rows: list[Row]) -> RunLog:
 
 def _read_judged(
     out: Path, arms: Sequence[str], seeds: Sequence[int]
-) -> dict[tuple[str, str], dict[str, np.ndarray]]:
+) -> dict[tuple[str, str, Action], dict[str, np.ndarray]]:
     """Reads the results of the final policies of finished arms."""
-    rows = {(row["arm"], row["stage"], row["seed"]): row for row in read_rows(out)}
+    keys = ("arm", "stage", "action", "seed")
+    rows = {tuple(row[key] for key in keys): row for row in read_rows(out)}
     judged = {}
-    for arm, stage in ((arm, stage) for arm in arms for stage in (LAST, EXPANDED)):
+    for arm, stage, action in itertools.product(arms, (LAST, EXPANDED), ACTIONS):
         for seed in seeds:
-            if (arm, stage, seed) not in rows:
+            if (arm, stage, action, seed) not in rows:
                 raise ConfigError(
-                    f"{out / EVALUATION} has no row of arm {arm}, seed {seed} on {stage}."
+                    f"{out / EVALUATION} has no row of arm {arm}, seed {seed} on {stage} with "
+                    f"{action} actions."
                 )
-        of_arm = [rows[arm, stage, seed] for seed in seeds]
-        judged[arm, stage] = {key: np.array([row[key] for row in of_arm]) for key in JUDGED}
+        of_arm = [rows[arm, stage, action, seed] for seed in seeds]
+        judged[arm, stage, action] = {key: np.array([row[key] for row in of_arm]) for key in JUDGED}
     return judged

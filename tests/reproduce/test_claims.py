@@ -1,6 +1,7 @@
 """Tests that verdicts reverse when the data are reversed, and stay open where data are unclear."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -53,9 +54,16 @@ def test_the_numbers_are_said() -> None:
     _, text = higher(_three(0.75), _three(0.25, 0.5, 0.25), unit=SHARE)
     # The interquartile mean of three values is their mean. The difference of the means is
     # 0.75 - 1 / 3, and its interval goes from 0.75 - 0.5 to 0.75 - 0.25.
-    assert text == "75.0 % against 33.3 %, difference +41.7 points (+25.0 to +50.0)"
+    # The interval is 25 points wide, so a standard error is 25 / 3.92, and 2.8 of them are 17.9.
+    assert text == (
+        "75.0 % against 33.3 %, difference +41.7 points (+25.0 to +50.0); 17.9 points would be "
+        "found in 8 of 10 studies"
+    )
     _, text = earlier(_three(300.0), _three(math.inf))
-    assert text == "300 against never, probability of being earlier 1 (1 to 1)"
+    assert text == (
+        "300 against never, probability of being earlier 1 (1 to 1); 0.5 would be found in 8 of "
+        "10 studies"
+    )
 
 
 @pytest.mark.parametrize(
@@ -201,26 +209,37 @@ def test_the_reward_is_compared_from_the_beginning_of_the_run() -> None:
     )
 
 
-def test_readings_that_disagree_decide_nothing() -> None:
+def test_sampled_actions_decide_and_other_readings_are_shown() -> None:
     reached = {"targets_reached": 0.9}
     data = reproduction({"curriculum": _steady_from(20), "baseline": [log([False] * 60)] * 3})
-    by_mean = reproduction(data.logs, {("curriculum", LAST): {}, ("baseline", LAST): reached})
-    found = claims.verdict(by_mean, BY_NAME["higher_success"])
-    assert [each.holds for each in found.findings] == [False, True]
-    assert (found.outcome, found.reason) == ("undecidable", "readings disagree")
+    judged = {("curriculum", LAST, "mean"): reached, ("baseline", LAST, "sampled"): reached}
+    found = claims.verdict(reproduction(data.logs, judged), BY_NAME["higher_success"])
+    assert [each.holds for each in found.findings] == [False, True, True]
+    assert (found.outcome, found.reason) == ("not reproduced", "")
+
+
+@pytest.mark.parametrize(("key", "value"), [("budget", 999_999), ("fine_tune", 6000)])
+def test_runs_shorter_than_the_papers_have_no_verdict(key: str, value: int) -> None:
+    data = reproduction({arm: _steady_from(20) for arm in ARMS})
+    short = replace(data, settings=replace(data.settings, **{key: value}))
+    for claim in CLAIMS:
+        found = claims.verdict(short, claim)
+        assert (found.outcome, found.reason) == ("no verdict", "too short")
+        assert {each.holds for each in found.findings} == {None}
+        assert claims.verdict(data, claim).outcome != "no verdict"
 
 
 def test_a_missing_arm_decides_nothing_and_is_named() -> None:
     shares = {("curriculum", EXPANDED): {"targets_reached": 0.9}, ("baseline", EXPANDED): {}}
     found = claims.verdict(reproduction(judged=shares), BY_NAME["expanded_better"])
-    assert [each.holds for each in found.findings] == [True, None]
-    assert found.findings[1].text == "lacks curriculum_expanded and baseline_expanded"
+    assert [each.holds for each in found.findings] == [None, None, True, True]
+    assert found.findings[0].text == "lacks curriculum_expanded and baseline_expanded"
     assert (found.outcome, found.reason) == ("undecidable", "an arm is missing")
 
 
 def test_too_few_episodes_leave_a_reading_open() -> None:
     data = reproduction({"curriculum": [log([True] * 19)] * 3, "baseline": [log([True] * 60)] * 3})
-    sampled = claims.verdict(data, BY_NAME["higher_success"]).findings[1]
+    sampled = claims.verdict(data, BY_NAME["higher_success"]).findings[2]
     assert (sampled.holds, sampled.text) == (None, "a seed has too few episodes for it")
 
 

@@ -50,18 +50,19 @@ def test_a_row_is_computed_from_all_episodes(
         )
 
     monkeypatch.setattr(engine_c, "simulate", simulate)
-    task = Task("baseline", 3, _policy(tmp_path, steering.STAY, 5), LAST)
+    task = Task("baseline", 3, _policy(tmp_path, steering.STAY, 5), LAST, "sampled")
     assert reproduce_judge.judge(task) == {
         "arm": "baseline",
         "seed": 3,
         "stage": LAST,
+        "action": "sampled",
         "targets_reached": 0.75,
         "all_reached": 0.5,
         "sensed_share": 0.5,
         "contacts_per_robot": 1.5,
     }
     ((judge, levels),) = seen
-    assert (judge.config.action, judge.config.step_limit, len(levels)) == ("mean", 5, 20)
+    assert (judge.config.action, judge.config.step_limit, len(levels)) == ("sampled", 5, 20)
     # The levels differ in their noise alone.
     assert all(np.array_equal(each.target, levels[0].target) for each in levels)
     assert len({int(each.seed) for each in levels}) == 20
@@ -73,5 +74,5 @@ def test_a_policy_that_stays_reaches_nothing(
 ) -> None:
     monkeypatch.setattr(reproduce_judge, "EPISODES", 2)
     path = _policy(tmp_path, steering.STAY, 5)
-    row = reproduce_judge.judge(Task("baseline", 0, path, stage))
+    row = reproduce_judge.judge(Task("baseline", 0, path, stage, "mean"))
     assert row["targets_reached"] == row["all_reached"] == 0.0

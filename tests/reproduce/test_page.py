@@ -11,7 +11,7 @@ from sentences import refusal
 
 from swarmjax.reproduce import claims as reproduce_claims
 from swarmjax.reproduce import page as reproduce_page
-from swarmjax.reproduce.rows import EXPANDED, LAST
+from swarmjax.reproduce.rows import ACTIONS, EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
 HOSTILE = "</style><script>alert(1)</script>"
@@ -58,12 +58,13 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     out = tmp_path_factory.mktemp("out")
     whole(out, arms=PAIR)
     judged = [
-        row(arm, seed, stage, targets_reached=0.5 + seed / 4)
+        row(arm, seed, stage, action, targets_reached=0.5 + seed / 4)
         for arm in PAIR
         for seed in SEEDS
         for stage in (LAST, EXPANDED)
+        for action in ACTIONS
     ]
-    (out / "evaluation.json").write_text(json.dumps({"format": 3, "rows": judged}))
+    (out / "evaluation.json").write_text(json.dumps({"format": 4, "rows": judged}))
     hostile = SUMMARY | {"commit": HOSTILE, "device": None, "train_s": None}
     (out / "baseline" / "summary.json").write_text(json.dumps(hostile))
     page = reproduce_page.write(out)
@@ -88,11 +89,11 @@ def test_the_header_says_how_the_data_came_about(partial: tuple[Path, Page]) -> 
 
 def test_the_table_that_the_paper_lacks(partial: tuple[Path, Page]) -> None:
     _, page = partial
-    [found] = page.starting("baseline", LAST)
+    [found] = page.starting("baseline", LAST, "mean")
     # The interquartile mean of three values trims none. The interval goes from the lowest to the
     # highest value, since one of 27 resamples holds the lowest three times, and one the highest.
-    assert found[2] == "75.0 % (50.0 to 100.0)"
-    assert found[3:] == [
+    assert found[3] == "75.0 % (50.0 to 100.0)"
+    assert found[4:] == [
         "60.0 % (60.0 to 60.0)",
         "10.0 % (10.0 to 10.0)",
         "1.5 (1.5 to 1.5)",
@@ -122,7 +123,8 @@ def test_every_claim_has_its_verdict(partial: tuple[Path, Page]) -> None:
         assert re.match("reproduced|not reproduced|undecidable", found[1])
         assert claim.criterion in page.text
     total = re.search(
-        r"Of (\d+) claims: (\d+) reproduced, (\d+) not reproduced, (\d+) und", page.text
+        r"Of (\d+) claims in the paper.s text: (\d+) reproduced, (\d+) not reproduced, (\d+) und",
+        page.text,
     )
     assert total is not None
     count, *parts = map(int, total.groups())
@@ -160,6 +162,20 @@ def test_a_single_arm_is_reported(tmp_path: Path) -> None:
         "robot 1 reached its target", "all episodes, episode number", "baseline"
     )[:1]
     assert found[3:5] == ["never", "never (never to never)"]
+
+
+def test_short_runs_have_no_verdicts_and_the_page_says_why(tmp_path: Path) -> None:
+    out = whole(tmp_path, arms=PAIR)
+    facts = json.loads((out / "reproduce.json").read_text())
+    facts["settings"]["budget"] = 12_000
+    (out / "reproduce.json").write_text(json.dumps(facts))
+    page = Page(reproduce_page.write(out).read_text())
+    assert "There are no verdicts: these runs are too short." in page.text
+    assert "each seed for\n1,000,000 control steps" in page.text
+    for claim in reproduce_claims.CLAIMS:
+        [found] = [found for found in page.rows if found[0].startswith(claim.quote)]
+        assert found[1] == "no verdicttoo short"
+        assert not re.search("holds|contradicted|open", found[2])
 
 
 def test_data_that_are_missing_are_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from reproductions import SEEDS, episode, row, whole, write
 from sentences import refusal
 
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.rows import EXPANDED, LAST
+from swarmjax.reproduce.rows import ACTIONS, EXPANDED, LAST
 
 PAIR = ("curriculum", "baseline")
 
@@ -58,12 +58,13 @@ def test_episodes_of_an_update_are_ordered_by_their_ends(tmp_path: Path) -> None
 
 def test_evaluations_are_laid_out_by_seed(tmp_path: Path) -> None:
     rows = [
-        row("baseline", seed, stage, targets_reached=share + seed / 10)
+        row("baseline", seed, stage, action, targets_reached=share + seed / 10)
         for stage, share in ((EXPANDED, 0.5), (LAST, 0.75))
         for seed in reversed(SEEDS)
+        for action in ACTIONS
     ]
     data = reproduce_rows.read(write(tmp_path, {"baseline": _three(episode(1))}, rows))
-    judged = {stage: data.judged["baseline", stage] for stage in (LAST, EXPANDED)}
+    judged = {stage: data.judged["baseline", stage, "mean"] for stage in (LAST, EXPANDED)}
     np.testing.assert_array_equal(judged[LAST]["targets_reached"], [0.75, 0.75 + 0.1, 0.75 + 0.2])
     np.testing.assert_array_equal(judged[EXPANDED]["targets_reached"], [0.5, 0.5 + 0.1, 0.5 + 0.2])
     np.testing.assert_array_equal(judged[EXPANDED]["contacts_per_robot"], [1.5] * 3)
@@ -98,9 +99,9 @@ def _drop(out: Path, text: str) -> None:
 REFUSED = {
     "no facts": (lambda out: (out / "reproduce.json").unlink(), "is not a reproduction"),
     "format": (
-        lambda out: _change(out, "reproduce.json", format=2),
-        "has format 2, but this version reads only format 3; commit d8b3078 was the last to read "
-        "format 2.",
+        lambda out: _change(out, "reproduce.json", format=3),
+        "has format 3, but this version reads only format 4; commit 8820a9f was the last to read "
+        "format 3.",
     ),
     "settings": (lambda out: _change(out, "reproduce.json", settings=[]), "as settings"),
     "a setting": (
