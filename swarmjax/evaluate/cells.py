@@ -40,7 +40,6 @@ class Cell(NamedTuple):
       episodes: [E] numbers of the levels.
       levels: [E] levels.
       steps: Control steps of an episode, or None for the command's number.
-      hull_friction: Friction of the robots' hulls, or None for the command's value.
     """
 
     name: str
@@ -50,7 +49,6 @@ class Cell(NamedTuple):
     episodes: np.ndarray
     levels: Level
     steps: int | None = None
-    hull_friction: float | None = None
 
     @property
     def digest(self) -> str:
@@ -150,7 +148,7 @@ def draw_cell(cell: CellConfig) -> Cell:
 def _cell(settings: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
     """Makes a cell, and checks its digest if its settings have one."""
     about = (settings.name, settings.stage, settings.realism, settings.seed)
-    cell = Cell(*about, episodes, levels, settings.steps, settings.hull_friction)
+    cell = Cell(*about, episodes, levels, settings.steps)
     if settings.digest not in (None, cell.digest):
         raise ConfigError(
             f"cell {cell.name} has the digest {cell.digest[:12]}..., but "
@@ -196,7 +194,7 @@ def write(path: Path, suite: Suite) -> None:
       ConfigError: The file cannot be written.
     """
     arrays = {f"{c.name}/{name}": x for c in suite.cells for name, x in _arrays(c).items()}
-    keys = ("name", "realism", "seed", "digest", "steps", "hull_friction")
+    keys = ("name", "realism", "seed", "digest", "steps")
     about = [
         {"stage": to_dict(cell.stage), "levels": len(cell.episodes)}
         | {key: getattr(cell, key) for key in keys}

@@ -33,9 +33,7 @@ class JudgeConfig(Section):
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     stage: StageConfig
-    robot: RobotConfig = field(
-        default_factory=lambda: RobotConfig(body="wheeled", hull_friction=HULL_FRICTION)
-    )
+    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = setting(
         None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"

@@ -9,7 +9,6 @@ from typing import Any, Literal
 from swarmjax.config import ConfigError, Section, about, build, files, reading, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.evaluate.config import MOST_STEPS
-from swarmjax.sim.config import MOST_HULL_FRICTION
 from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig, complete
 
@@ -34,9 +33,6 @@ class CellConfig(Section):
     )
     steps: int | None = setting(
         None, "control steps of an episode; null: as set for the command", 1, MOST_STEPS
-    )
-    hull_friction: float | None = setting(
-        None, "of the robots; null: the command's", 0.0, MOST_HULL_FRICTION
     )
     digest: str | None = setting(None, "SHA-256 of the levels; null: not checked")
 

@@ -107,8 +107,8 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage and seed. A cell with values for realism or hull
-        friction sets these too. A cell with a step limit sets it if `config` has none.
+      cell: Cell that sets the stage and seed. A cell with a realism sets it too, and a cell with a
+        step limit if `config` has none.
 
     Returns:
       The settings.
@@ -116,12 +116,8 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
     realism = config.realism
     if cell.realism is not None:
         realism = build(RealismConfig, files.read_choice("realism", cell.realism))
-    robot = config.robot
-    if cell.hull_friction is not None:
-        robot = replace(robot, hull_friction=cell.hull_friction)
     return replace(
         config,
-        robot=robot,
         suite=None,
         stage=cell.stage,
         realism=realism,

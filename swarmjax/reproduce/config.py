@@ -29,12 +29,7 @@ class ReproduceConfig(Section):
     command: ClassVar[str] = "reproduce"
 
     seeds: int = setting(10, "seeds of each arm", LEAST_DRAWN, 4096)
-    budget: int = setting(
-        BUDGET,
-        "control steps of a seed; with fewer than these there are no verdicts",
-        UPDATE,
-        _MOST,
-    )
+    budget: int = setting(BUDGET, "control steps of a seed; fewer: no verdicts", UPDATE, _MOST)
     fine_tune: int = setting(FINE_TUNE, "the same at 1.5 m", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(

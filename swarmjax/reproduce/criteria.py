@@ -73,9 +73,7 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
-    found = NUMBER.value(min(1.0, 0.5 + _POWER * (chance.high - chance.low)))
     text = f"{both}, probability of being earlier {NUMBER.interval(chance)}"
-    text += f"; {found} would be found in 8 of 10 studies"
     return _sign(chance.low - 0.5, chance.high - 0.5), text
 
 

@@ -13,7 +13,6 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import builder
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
-from swarmjax.reproduce.config import BUDGET, FINE_TUNE
 from swarmjax.reproduce.measures import FINAL, PLACE, Unit
 from swarmjax.reproduce.rows import ARMS, LAST, MODERN, PAIR, Reproduction
 
@@ -75,8 +74,6 @@ def _page(
         lacking=data.lacking(ARMS),
         verdicts=verdicts,
         counts=", ".join(f"{outcomes.count(name)} {name}" for name in _OUTCOMES),
-        paper_budget=BUDGET,
-        paper_fine_tune=FINE_TUNE,
         held=claims.HELD,
         last=LAST,
         figures=figures,

@@ -17,7 +17,6 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-LARGEST = 2**30  # bytes; a program of the default run takes one thousandth of this
 _DIRECTORY = "jax_compilation_cache_dir"
 
 
@@ -38,7 +37,6 @@ def use() -> Iterator[None]:
     try:
         directory = default_directory()
         _open(directory)
-        _shorten(directory)
     except (OSError, RuntimeError) as error:  # RuntimeError: the home directory is unknown
         sys.stderr.write(f"swarmjax: compiled programs will not be kept: {error}.\n")
         yield
@@ -70,20 +68,6 @@ def _open(directory: Path) -> None:
     mine = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
     if not mine or (os.name == "posix" and found.st_mode & 0o022):
         raise OSError(f"other users can write to {directory} and could run code through it")
-
-
-def _shorten(directory: Path) -> None:
-    """Deletes the least recently used programs when the cache is too large.
-
-    JAX does this only where the package filelock is installed.
-    """
-    found = [(path, path.stat()) for path in directory.glob("*-cache")]
-    found.sort(key=lambda entry: max(entry[1].st_atime, entry[1].st_mtime), reverse=True)
-    total = 0
-    for path, stat in found:
-        total += stat.st_size
-        if total > LARGEST:
-            path.unlink(missing_ok=True)
 
 
 def _configure(options: Mapping[str, object]) -> None:

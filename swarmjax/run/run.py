@@ -171,7 +171,6 @@ class Run:
         self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
         init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
         shapes = init.eval_shape(self.schedule)
-        memory.check(settings, mesh.bytes_each(settings, shapes))
         self.state = self._first_state(init, shapes, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)

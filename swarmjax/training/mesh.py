@@ -147,17 +147,6 @@ def put(program: Program, state: TrainState) -> TrainState:
     )
 
 
-def bytes_each(config: ProgramConfig, state: TrainState) -> int:
-    """Returns the bytes of a state that one device holds.
-
-    Args:
-      config: settings of the run.
-      state: [N] states of all devices, or their shapes from `jax.eval_shape`.
-    """
-    spread = seeds.size(state if config.seeds_by == "devices" else state.arenas)
-    return seeds.size(state) - spread + spread // config.devices
-
-
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:
     """Takes out of a state the arenas that this process's first device steps together.
 

@@ -5,7 +5,6 @@ Seed k is `config.seed + k`. A single seed has the axis too, so that there is on
 checkpoint and metrics.
 """
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -60,8 +59,3 @@ def split(lanes: Any, parts: int) -> list[Any]:
 def join(parts: list[Any]) -> Any:
     """Undoes `split`."""
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-
-
-def size(tree: Any) -> int:
-    """Returns the bytes of a tree's arrays, or of their shapes from `jax.eval_shape`."""
-    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

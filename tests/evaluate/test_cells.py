@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from sentences import refusal
 
 from swarmjax.config import ConfigError, files
-from swarmjax.evaluate import cells, trials
+from swarmjax.evaluate import cells
 from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.suite_config import SUITE_SEED, CellConfig, read_suite
@@ -38,8 +38,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     file.write_text(
         _text(
             "name: one, stage: s1, levels: 3, seed: 1000001",
-            "name: two, stage: s3, levels: 2, seed: 1000002, realism: real, "
-            "steps: 70, hull_friction: 0.5",
+            "name: two, stage: s3, levels: 2, seed: 1000002, realism: real, steps: 70",
             "name: some, stage: {robots: 3, side: [0.9, 1.1], obstacles: 1}, levels: 2, "
             "seed: 1000003, episodes: [7, 4]",
         )
@@ -77,20 +76,12 @@ def test_a_file_of_levels_gives_them_back(tmp_path: Path, tiny: Suite) -> None:
     for mine, theirs in zip(found.cells, tiny.cells, strict=True):
         assert mine.digest == theirs.digest
         assert mine[:4] == theirs[:4]
-        assert (mine.steps, mine.hull_friction) == (theirs.steps, theirs.hull_friction)
+        assert mine.steps == theirs.steps
         for a, b in zip(mine.levels, theirs.levels, strict=True):
             np.testing.assert_array_equal(a, b)
             assert a.dtype == b.dtype
     loaded = cells.load(EvaluateConfig(policy="", stage=tiny.cells[0].stage, suite=str(path)))
     assert [cell.name for cell in loaded.cells] == ["one", "two", "some"]
-
-
-def test_a_cell_has_a_friction_of_hulls_of_its_own(tiny: Suite) -> None:
-    typed = EvaluateConfig(
-        policy="", stage=tiny.cells[0].stage, robot=RobotConfig(hull_friction=1.0)
-    )
-    found = [trials.specialise(typed, cell).robot.hull_friction for cell in tiny.cells]
-    assert found == [1.0, 0.5, 1.0]
 
 
 def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:

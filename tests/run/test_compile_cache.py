@@ -155,17 +155,3 @@ def test_everything_is_put_back(own: Path) -> None:
     with compile_cache.use():
         assert jax.config.jax_compilation_cache_dir == str(own)
     assert {name: getattr(jax.config, name) for name in _NAMES} == before
-
-
-def test_a_large_cache_loses_what_was_used_longest_ago(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    new, middle, old = (f"jit_{age}-{'0' * 64}-cache" for age in ("new", "middle", "old"))
-    for age, name in enumerate((new, middle, old)):
-        (tmp_path / name).write_bytes(bytes(100))
-        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
-    (tmp_path / "mine").write_bytes(bytes(1000))
-    os.utime(tmp_path / old, (1e9 + 1, 0.0))  # read later than the other entries
-    monkeypatch.setattr(compile_cache, "LARGEST", 250)
-    compile_cache._shorten(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {new, old, "mine"}

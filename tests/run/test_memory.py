@@ -14,17 +14,9 @@ from swarmjax.run import compiled, directory, memory
 from swarmjax.run import run as runs
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task.stage_config import StageConfig
-from swarmjax.training import seeds
 
 GIB = 2**30
 SETTINGS = TrainConfig(stage=(StageConfig(name="pair", robots=2, side=0.5),), budget=10**9)
-
-
-def test_the_bytes_of_a_tree_are_those_of_its_arrays() -> None:
-    tree = {"a": jnp.zeros((3, 5)), "b": jnp.zeros(7, jnp.int8)}
-    assert seeds.size(tree) == 3 * 5 * 4 + 7
-    assert seeds.size(jax.eval_shape(lambda: tree)) == 3 * 5 * 4 + 7
-    assert seeds.size(jax.random.split(jax.random.key(0), 4)) == 4 * 8  # a key has two words
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone has it")
@@ -83,17 +75,6 @@ WORDS = [
     "task.step_limit=8",
     "budget=1e9",
 ]
-
-
-def test_a_state_too_large_is_refused_before_anything_is_compiled_or_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(memory, "limit", lambda: 2**20)
-    for each in ("_first_state", "compile"):
-        monkeypatch.setattr(runs.Run, each, lambda *_: pytest.fail("nothing to do"))
-    with pytest.raises(ConfigError, match=r"^arenas is 1048576 and seeds is 1, which needs "):
-        train.main([*WORDS, "arenas=1048576", f"run.dir={tmp_path / 'run'}"])
-    assert directory.visible(tmp_path / "run") == []
 
 
 def test_an_absurd_number_is_refused_by_the_config() -> None:
