@@ -69,7 +69,8 @@ def test_levels_are_written_in_the_order_in_which_they_were_named(steer, tmp_pat
 
 def test_the_worst_are_replayed(steer, tmp_path, capsys):
     words = [f"policy={steer}", *QUICK, "steps=150", "episodes=8"]
-    _, every = replays.recorded(steer, *words[1:], "level=0,1,2,3,4,5,6,7")
+    rubs = "robot.hull_friction=1"  # as the command by default
+    _, every = replays.recorded(steer, *words[1:], rubs, "level=0,1,2,3,4,5,6,7")
     reached = np.array([(each.arrival > 0).sum() for each in every])
     contacts = np.array([each.contacts[-1].sum() for each in every])
     frames = np.array([len(each.pose) for each in every])

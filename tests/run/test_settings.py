@@ -392,5 +392,7 @@ def test_help_gives_default_meaning_and_allowed_values():
 def test_help_names_groups_and_their_choices():
     text = " ".join(help_text(TrainConfig, "swarmjax.train").split())
     assert f"stage=curriculum ({CHOICES})" in text
-    assert "robot=<as trained, on wheels>" in help_text(EvaluateConfig, "swarmjax.evaluate")
+    assert "robot=<as trained, on wheels and with hulls of friction 1>" in help_text(
+        EvaluateConfig, "swarmjax.evaluate"
+    )
     assert "Groups" not in help_text(ExportConfig, "swarmjax.export")

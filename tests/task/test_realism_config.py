@@ -317,7 +317,13 @@ def test_a_range_begins_with_the_lower_number():
     ("cls", "command", "robot", "realism", "mass"),
     [
         (TrainConfig, "train", "planar", "ideal", "null"),
-        (EvaluateConfig, "evaluate", "<as trained, on wheels>", "<as trained>", "<as trained>"),
+        (
+            EvaluateConfig,
+            "evaluate",
+            "<as trained, on wheels and with hulls of friction 1>",
+            "<as trained>",
+            "<as trained>",
+        ),
     ],
 )
 def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
