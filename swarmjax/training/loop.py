@@ -162,7 +162,7 @@ def carry_over(
       The learners, [L].
     """
     options, carried = program.config.curriculum, learners
-    count = program.config.learners
+    count = jax.tree.leaves(learners)[0].shape[0]
     if count > 1:  # learner i % before.met is copied to the place of learner i
         index = jnp.arange(count)
         new = (index >= before.met) & (index < after.met)

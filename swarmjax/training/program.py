@@ -42,6 +42,7 @@ def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) 
         world,
         load_ppo(config, world),
         partial(stages.make, options=config.curriculum, own=own),
+        shards(config),
         by_robot=by_robot,
         waiting=config.waiting,
         rows=min(config.updates, rows),
@@ -81,9 +82,14 @@ def load_ppo(config: ProgramConfig, world: World) -> PPO:
         sizes,
         config.updates,
         pieces=extension.load(config.extensions).networks,
-        shards=Shards(config.arena_devices, config.stream_count),
+        shards=shards(config),
         side_by_side=side_by_side(config) * config.learners,
     )
+
+
+def shards(config: ProgramConfig) -> Shards:
+    """Returns how the arenas are spread over devices and random streams."""
+    return Shards(config.arena_devices, config.stream_count)
 
 
 def load_world(config: ProgramConfig) -> World:

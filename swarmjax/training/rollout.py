@@ -38,6 +38,7 @@ class Program[C: ProgramConfig]:
       world: the compiled environment.
       ppo: how the learners act and learn.
       curriculum: makes the curriculum with the numbers of a schedule.
+      shards: how the arenas are spread over devices.
       by_robot: whether to report each episode robot by robot.
       waiting: episodes that are drawn for each arena before a rollout.
       rows: most updates of one call.
@@ -47,14 +48,10 @@ class Program[C: ProgramConfig]:
     world: World
     ppo: PPO
     curriculum: Callable[[Schedule], Curriculum]
+    shards: Shards = ALONE
     by_robot: bool = False
     waiting: int = 1
     rows: int = 1
-
-    @property
-    def shards(self) -> Shards:
-        """How the arenas are spread over devices."""
-        return Shards(self.config.arena_devices, self.config.stream_count)
 
 
 @struct.dataclass
