@@ -97,8 +97,10 @@ def test_an_update_sums_once_a_minibatch_and_five_times_more(alone: Found, sprea
 
 def test_every_device_has_the_same_levels(words: str, alone: Found, spread: Found) -> None:
     assert ("scores" in alone) == (words == LEVELS)
-    if words == LEVELS:  # a value loss is a mean of float32
-        np.testing.assert_allclose(spread["scores"], alone["scores"], rtol=1e-4)
+    if words == LEVELS:
+        # A value loss is a mean of advantages, differences of float32 numbers of order 1: a few
+        # roundings of 1.2e-7 remain of a loss near 0 (3.8e-7 were measured).
+        np.testing.assert_allclose(spread["scores"], alone["scores"], rtol=1e-4, atol=1e-6)
 
 
 def test_the_curriculum_moves_on(alone: Found) -> None:
