@@ -57,11 +57,9 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
     both = " against ".join(unit.value(float(iqm(each))) for each in (ours, theirs))
-    found = unit.value(_POWER * (more.high - more.low)).removesuffix(unit.suffix)
-    text = f"{both}, difference {unit.difference(more)}"
-    return _sign(
-        more.low, more.high
-    ), f"{text}; {found}{unit.apart} would be found in 8 of 10 studies"
+    least = f"{unit.number(_POWER * (more.high - more.low))}{unit.apart}"
+    text = f"{both}, difference {unit.difference(more)}; {least} would be found in 8 of 10 studies"
+    return _sign(more.low, more.high), text
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:

@@ -13,6 +13,7 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.pages import builder
 from swarmjax.reproduce import claims, measures
 from swarmjax.reproduce import rows as reproduce_rows
+from swarmjax.reproduce.config import BUDGET, FINE_TUNE
 from swarmjax.reproduce.measures import FINAL, PLACE, Unit
 from swarmjax.reproduce.rows import ARMS, LAST, MODERN, PAIR, Reproduction
 
@@ -58,19 +59,15 @@ def _page(
         if arm in data.logs
     ]
     settings = to_dict(replace(data.settings, out=None, resume=None, minutes=None))
+    given = {key: value for key, value in settings.items() if value is not None}
     return builder.render(
         "reproduce/reproduce.html",
+        paper_budget=BUDGET,
+        paper_fine_tune=FINE_TUNE,
         styles=(builder.STYLE, "reproduce/reproduce.css"),
         title="The published experiment, reproduced",
         data=data,
-        made_by=command.line(
-            "reproduce",
-            *(
-                f"{key}={files.write(value)}"
-                for key, value in settings.items()
-                if value is not None
-            ),
-        ),
+        made_by=command.line("reproduce", *files.write_words(given)),
         lacking=data.lacking(ARMS),
         verdicts=verdicts,
         counts=", ".join(f"{outcomes.count(name)} {name}" for name in _OUTCOMES),

@@ -48,7 +48,7 @@ class Program[C: ProgramConfig]:
     world: World
     ppo: PPO
     curriculum: Callable[[Schedule], Curriculum]
-    shards: Shards = ALONE
+    shards: Shards
     by_robot: bool = False
     waiting: int = 1
     rows: int = 1

@@ -17,6 +17,7 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Sizes
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.settings import TrainConfig
+from swarmjax.shards import ALONE
 from swarmjax.training import loop
 from swarmjax.training import program as programs
 from swarmjax.training.rollout import Program
@@ -70,7 +71,9 @@ def _promote(
 ) -> LearnerState:
     chosen = replace(config, curriculum=CurriculumConfig(mode="sequential", **options))
     nowhere: Any = None  # nothing is simulated
-    program = Program(chosen, nowhere, learners.ppo(chosen.algo, Sizes(OBSERVED, 2)), nowhere)
+    program = Program(
+        chosen, nowhere, learners.ppo(chosen.algo, Sizes(OBSERVED, 2)), nowhere, ALONE
+    )
     schedule = programs.schedule(chosen)
     state = engine.init(stages.make(schedule, chosen.curriculum), schedule)
     reason = jnp.int32(engine.BY_THRESHOLD if promoted else engine.STAYED)
