@@ -1,5 +1,6 @@
 """Tests `python -m swarmjax.reproduce` from end to end with few steps, and all its refusals."""
 
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -66,9 +67,9 @@ def test_what_was_stopped_goes_on_and_is_judged(
         assert len(log) == sum(row["episodes"] for row in mine) >= 160  # up to 32 steps per episode
         assert log.sensed.sum() == sum(row["sensed"] for row in mine)
     rows = json.loads((out / "evaluation.json").read_text())["rows"]
-    named = [(row["arm"], row["seed"], row["stage"]) for row in rows]
-    stages = ("paper6", "paper_expanded")
-    assert named == [("baseline", seed, stage) for seed in range(3) for stage in stages]
+    named = [(row["arm"], row["seed"], row["stage"], row["action"]) for row in rows]
+    stages, actions = ("paper6", "paper_expanded"), ("sampled", "mean")
+    assert named == [*itertools.product(["baseline"], range(3), stages, actions)]
     # Everything is finished, so nothing is trained or judged again.
     before = {path: path.stat().st_mtime_ns for path in (out / "baseline").rglob("*")}
     assert reproduce.main([f"resume={out}"]) == 0
