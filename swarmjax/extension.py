@@ -35,7 +35,7 @@ TAKEN = {
         *("trap", "fence", "bay", "row", "door", "maze", "circle", "crowd"),
     ),
     "network": ("mlp",),
-    "curriculum": ("sequential", "mixed", "adaptive"),
+    "curriculum": ("sequential", "mixed", "adaptive", "frontier"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _LARGEST = 3.4e38  # as in `config.section`: float32 holds nothing beyond

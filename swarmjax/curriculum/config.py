@@ -1,19 +1,21 @@
 """The settings of the curriculum."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
-from swarmjax.config import ConfigError, Section, setting, show
-from swarmjax.config.section import check_options
+from swarmjax.config import ConfigError, Section, about, setting, show
+from swarmjax.config.section import ByName, check_options
 from swarmjax.extension import OwnCurriculum
 
 PROMOTING = ("sequential", "mixed")  # modes that move from stage to stage
-MODES = (*PROMOTING, "adaptive")
+MODES = (*PROMOTING, "adaptive", "frontier")
 # The modes that read an option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
-    **dict.fromkeys(("threshold", "budget_share", "optimizer", "exploration"), ("mode", PROMOTING)),
-    **dict.fromkeys(("score", "floor", "shares"), ("mode", ("adaptive",))),
+    **dict.fromkeys(("budget_share", "optimizer", "exploration"), ("mode", PROMOTING)),
+    **dict.fromkeys(("score", "shares"), ("mode", ("adaptive",))),
+    "threshold": ("mode", (*PROMOTING, "frontier")),
+    "floor": ("mode", ("adaptive", "frontier")),
 }
 
 
@@ -27,8 +29,15 @@ class CurriculumConfig(Section):
     mode: str = setting(
         "mixed",
         "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
-        "on all stages, more of them on stages with a higher score; or the name of an "
-        "extension's curriculum",
+        "on all stages, more of them on stages with a higher score; frontier: on the stages whose "
+        "easier neighbours are learned; or the name of an extension's curriculum",
+    )
+    axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
+        default_factory=ByName,
+        metadata=about(
+            "easier values of the stage's numbers, from easy to hard, by name; each combination "
+            "becomes a stage, and mode is frontier unless given"
+        ),
     )
     success: Literal["targets", "all"] = setting(
         "targets",
@@ -36,7 +45,7 @@ class CurriculumConfig(Section):
         "which all robots arrived",
     )
     threshold: float = setting(
-        0.8, "success at which training moves on to the next stage [sequential, mixed]", 0.0, 1.0
+        0.8, "success at which a stage is learned [sequential, mixed, frontier]", 0.0, 1.0
     )
     budget_share: float = setting(
         0.5,
@@ -49,7 +58,10 @@ class CurriculumConfig(Section):
         "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]",
     )
     floor: float = setting(
-        0.1, "share of the arenas spread evenly over all stages [adaptive]", above=0.0, high=1.0
+        0.1,
+        "share of the arenas spread evenly over all stages [adaptive, frontier]",
+        above=0.0,
+        high=1.0,
     )
     shares: Literal["arenas", "robots"] = setting(
         "arenas",

@@ -55,6 +55,7 @@ class Schedule(NamedTuple):
       threshold: [] success that promotes.
       floor: [] share of the arenas that is spread evenly over all stages.
       cohort_updates: [] updates of one step limit, int32.
+      easier: [S, S] whether the second stage has to be learned before the first opens, bool.
     """
 
     stages: Stage
@@ -62,6 +63,7 @@ class Schedule(NamedTuple):
     threshold: Array | np.float32
     floor: Array | np.float32
     cohort_updates: Array | np.int32
+    easier: Array | np.ndarray
 
 
 class StageChoice(NamedTuple):

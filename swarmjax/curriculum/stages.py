@@ -1,4 +1,4 @@
-"""The built-in curricula over stages: `sequential`, `mixed` and `adaptive`.
+"""The built-in curricula over stages: `sequential`, `mixed`, `adaptive` and `frontier`.
 
 A mode is one pure function. After each update it gets the newest verdicts and returns the newest
 stage, the share of the arenas on each stage, and the reason. A mode is also called before the first
@@ -33,7 +33,9 @@ from swarmjax.curriculum.engine import (
 from swarmjax.extension import OwnCurriculum
 from swarmjax.task import extended
 
-_EARLIER = 0.2  # share of the arenas on earlier stages with `mixed`: this project's choice
+# Share of the arenas on earlier stages with `mixed`, on learned ones with `frontier`: this
+# project's choice.
+_EARLIER = 0.2
 _UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
@@ -214,6 +216,55 @@ def adaptive(
     )
 
 
+def frontier(
+    state: StagesState,
+    schedule: Schedule,
+    options: CurriculumConfig,
+    verdict: CohortVerdict,
+    update: Array,
+) -> StageChoice:
+    """Trains the open stages that are not learned yet, and keeps some arenas on learned ones.
+
+    A stage is learned while its running success is at least `threshold`. It is open while all
+    stages one step easier are learned. So success widens the frontier, failure narrows it, and no
+    budget moves it. The last stage stays in training once it is open. Widening each axis by its own
+    success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube with a
+    Robot Hand", arXiv:1910.07113, section 5).
+
+    Args:
+      state: as in `promoting`.
+      schedule: as in `promoting`.
+      options: as in `promoting`.
+      verdict: as in `promoting`.
+      update: as in `promoting`.
+
+    Returns:
+      The choice from the next update on; its newest stage is the hardest open one.
+    """
+    stages = state.chosen.weights.shape[0]
+    index = jnp.arange(stages)
+    learned = verdict.record.fast >= schedule.threshold
+    is_open = ~jnp.any(jnp.asarray(schedule.easier) & ~learned, axis=-1)
+    front = is_open & (~learned | (index == stages - 1))
+    learned &= ~front
+    front |= ~jnp.any(front) & is_open
+    kept = jnp.where(jnp.any(learned), _EARLIER, 0.0)
+    floor = jnp.asarray(schedule.floor)
+    weights = (1.0 - kept) * _evenly(front) + kept * _evenly(learned)
+    weights = floor / stages + (1.0 - floor) * weights
+    changed = verdict.over & jnp.any(weights != state.chosen.weights)
+    return StageChoice(
+        stage=jnp.max(jnp.where(is_open, index, 0)).astype(jnp.int32),
+        weights=jnp.where(verdict.over, weights, state.chosen.weights),
+        reason=jnp.where(changed & (update >= 0), REWEIGHED, STAYED).astype(jnp.int32),
+    )
+
+
+def _evenly(chosen: Array) -> Array:
+    """Divides 1 evenly among the chosen stages [S]; all 0 if none is chosen."""
+    return chosen / jnp.maximum(jnp.sum(chosen), 1)
+
+
 def _score(record: Record, score: str) -> Array:
     """Returns the score [S] of each stage; a stage without a verdict has the largest score."""
     known, success = jnp.isfinite(record.fast), record.fast
@@ -222,4 +273,9 @@ def _score(record: Record, score: str) -> Array:
     return jnp.where(known, success * (1.0 - success), _UNKNOWN_LEARNABILITY)
 
 
-MODES: dict[str, Mode] = {"sequential": promoting, "mixed": promoting, "adaptive": adaptive}
+MODES: dict[str, Mode] = {
+    "sequential": promoting,
+    "mixed": promoting,
+    "adaptive": adaptive,
+    "frontier": frontier,
+}

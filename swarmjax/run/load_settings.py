@@ -8,6 +8,7 @@ from typing import Any
 from swarmjax import extension
 from swarmjax.config import ConfigError, build, check_text, files, inherit, reading, show, to_dict
 from swarmjax.config.section import build_stored
+from swarmjax.curriculum import axes
 from swarmjax.curriculum.config import check_mode
 from swarmjax.ppo.config import resolve
 from swarmjax.run import recipes
@@ -79,13 +80,34 @@ def load_train(
     """
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
-        if stages is not None:
-            return mapping | {"stage": list(stages)}
-        found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
-        return mapping | {"stage": found, "stage_name": stage_files.name_of(chosen["stage"])}
+        if stages is None:
+            found = stage_files.expand(mapping.get("stage", {}), chosen["stage"])
+            mapping = mapping | {"stage_name": stage_files.name_of(chosen["stage"])}
+        else:
+            found = list(stages)
+        options = mapping.get("curriculum", {})
+        if options.get("axes"):
+            found = _grid(found, options["axes"])
+            mapping = mapping | {"curriculum": {"mode": "frontier"} | options}
+        return mapping | {"stage": found}
 
     given = recipes.expand(TrainConfig, overrides)
     return settle(files.load(TrainConfig, [*_inherited(given), *given], complete))
+
+
+def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
+    """Returns the stages of a curriculum along axes, which end at a single stage."""
+    if len(stages) > 1:
+        raise ConfigError(
+            f"curriculum.axes needs one stage, but stage names {len(stages)}: give one, as in "
+            f"stage={stages[-1]['name']}."
+        )
+    if not isinstance(along, Mapping):
+        raise ConfigError(
+            f"curriculum.axes is {show(along)}: give values by name, as in "
+            "curriculum.axes.robots=[2,5,10]."
+        )
+    return axes.expand(stages[0], along)
 
 
 def _inherited(typed: Sequence[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """The settings of a training run, and checks that involve several sections."""
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -82,7 +83,12 @@ class TrainConfig(ProgramConfig):
     def _check_stages(self) -> None:
         if not self.stage:
             raise ConfigError("stage is []: give at least one stage.")
-        names = self.stage_names
+        names, along = self.stage_names, self.curriculum.axes
+        if along and (count := math.prod(len(each) + 1 for each in along.values())) != len(names):
+            raise ConfigError(
+                f"curriculum.axes makes {count} stages, but stage names {len(names)}: leave one of "
+                "them out."
+            )
         for name in names:
             if names.count(name) > 1:
                 raise ConfigError(f"stage names {name} more than once: give each stage once.")

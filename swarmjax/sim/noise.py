@@ -16,7 +16,7 @@ Array = Any
 class Stream(enum.IntEnum):
     """Purpose of a random number; values must never change, so that old levels still replay.
 
-    Streams up to `LAYOUT` are drawn once per episode, at clock 0; the others at each
+    Streams up to `WAY` are drawn once per episode, at clock 0; the others at each
     control step.
     """
 
@@ -36,6 +36,7 @@ class Stream(enum.IntEnum):
     OBSERVATION_LATENCY = 17
     ARENA_SIDE = 18
     LAYOUT = 19
+    WAY = 20
     INFRARED = 32
     SPEED_NOISE = 33
     TARGET_DISTANCE = 36

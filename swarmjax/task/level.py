@@ -11,7 +11,7 @@ import numpy as np
 
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
-from swarmjax.task import fixed_level
+from swarmjax.task import fixed_level, ways
 from swarmjax.task.layouts import drawing
 from swarmjax.task.layouts.drawing import Kind, LayoutArrays
 from swarmjax.task.maps import MapArrays
@@ -126,6 +126,8 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     for kind, arrays in (stage.layouts or {}).items():
         laid_out = _laid_out(kind, arrays, level.seed, stage, spacing, xp)
         level = _either(arrays.chosen, laid_out, level, xp)
+    if stage.distance is not None:
+        level = _at_distance(level, stage.distance, spacing, xp)
     return park(level, xp)
 
 
@@ -286,6 +288,13 @@ def _laid_out(
         obstacle=xp.where(mine, _rows(drawn.wall, spacing.obstacles, xp), absent),
         seed=seed,
     )
+
+
+def _at_distance(level: Level, distance: Array, spacing: Spacing, xp: Any) -> Level:
+    """Moves the starts to places with a given way to their targets, if the stage gives one."""
+    place, _ = ways.starts(level, distance, spacing.hull_radius, spacing.target_radius, xp)
+    start = xp.concatenate([metres(place, xp), level.start[:, 2:]], axis=-1)
+    return level._replace(start=xp.where(distance[1] > 0, start, level.start))
 
 
 def _rows(array: Array, count: int, xp: Any) -> Array:

@@ -18,7 +18,7 @@ LATTICE = 24  # points along a side
 MARGIN = 0.02  # m; least free space around anything at the start
 TARGET_SPACING = 0.25  # m; least distance between targets where the arena has room
 _UNROLLED = 5  # number of objects placed without a loop; XLA would take a second to compile twenty
-_FORBIDDEN = -(2**30)  # a score at or below half of this means that a hard distance is violated
+FORBIDDEN = -(2**30)  # a score at or below half of this means that a hard distance is violated
 
 
 class Gap(NamedTuple):
@@ -126,7 +126,7 @@ def score_walls(points: Array, side: Array, gap: Array, xp: Any) -> Array:
       [P] 0 where the distance is kept, very low where it is not.
     """
     spare = side // 2 - xp.max(xp.abs(points), axis=-1) - gap
-    return xp.where(spare >= 0, 0, _FORBIDDEN + spare)
+    return xp.where(spare >= 0, 0, FORBIDDEN + spare)
 
 
 def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any) -> Array:
@@ -146,7 +146,7 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
     apart = points[:, None, :] - centres[None, :, :]
     square = xp.sum(apart * apart, axis=-1)
     lacking = xp.minimum(square - gap.soft * gap.soft, 0)
-    worst = xp.where(square < gap.hard * gap.hard, _FORBIDDEN + square, lacking)
+    worst = xp.where(square < gap.hard * gap.hard, FORBIDDEN + square, lacking)
     return xp.min(xp.where(there, worst, 0), axis=-1, initial=0)
 
 
@@ -161,7 +161,7 @@ def score_open(points: Array, is_open: Array, xp: Any) -> Array:
     Returns:
       [P] 0 where a point is open, very low where it is not.
     """
-    return xp.where(is_open, 0, _FORBIDDEN + 0 * points[:, 0])
+    return xp.where(is_open, 0, FORBIDDEN + 0 * points[:, 0])
 
 
 def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp: Any) -> Array:
@@ -180,7 +180,7 @@ def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp
     apart = xp.abs(points[:, None, :] - rectangle[None, :, :2]) - rectangle[None, :, 2:]
     apart = xp.maximum(apart, 0)
     square = xp.sum(apart * apart, axis=-1)
-    score = xp.where(square < gap * gap, _FORBIDDEN + square, 0)
+    score = xp.where(square < gap * gap, FORBIDDEN + square, 0)
     return xp.min(xp.where(there, score, 0), axis=-1)
 
 
@@ -203,15 +203,17 @@ def place(
 
     def step(score: Array, one: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         pick, is_there = one
-        best = _choose(score, pick, xp)
-        kept = is_there & (score[best] > _FORBIDDEN // 2)
+        best = choose(score, pick, xp)
+        kept = is_there & (score[best] > FORBIDDEN // 2)
         against = score_things(points, points[best][None], is_there[None], gap, xp)
         return xp.minimum(score, against), (points[best], kept)
 
-    return _fold(step, score, (picks, there), xp)
+    return fold(step, score, (picks, there), xp)
 
 
-def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> tuple[Array, Array]:
+def fold(
+    step: Callable, state: Array, rows: tuple[Array, Array], xp: Any, unroll: int = _UNROLLED
+) -> tuple[Array, Array]:
     """Calls `step` for each row, passes its state on to the next call, and stacks the results."""
     if xp is not np:
         from jax import lax  # evaluations draw levels without JAX
@@ -220,7 +222,7 @@ def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> t
         # search at compile time, arena by arena. For 4,096 arenas of a trap, this took 105 s on two
         # cores.
         state = lax.optimization_barrier(state)
-        return lax.scan(step, state, rows, unroll=max(1, min(_UNROLLED, len(rows[0]))))[1]
+        return lax.scan(step, state, rows, unroll=max(1, min(unroll, len(rows[0]))))[1]
     first, second = [], []
     for one in zip(*rows, strict=True):
         state, found = step(state, one)
@@ -229,7 +231,7 @@ def _fold(step: Callable, state: Array, rows: tuple[Array, Array], xp: Any) -> t
     return np.array(first, np.int32).reshape(-1, 2), np.array(second, bool)
 
 
-def _choose(score: Array, pick: Array, xp: Any) -> Array:
+def choose(score: Array, pick: Array, xp: Any) -> Array:
     """Picks uniformly among the points that score 0; without any, picks the best point."""
     rank = xp.cumsum((score >= 0).astype(xp.int32))
     free = rank[-1]

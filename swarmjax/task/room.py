@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
 from swarmjax.sim import gaps
-from swarmjax.task import level
+from swarmjax.task import level, ways
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
+from swarmjax.task.placement import MARGIN, round_up
 from swarmjax.task.stage_config import StageConfig
 
 _TRIED = 16  # levels of a stage to check
@@ -36,7 +37,7 @@ def check(
     )
     for stage in stages:
         own = next((piece for piece in drawings if piece.name == stage.level), None)
-        if own is None and not stage.map and stage.kind is None:
+        if own is None and not stage.map and stage.kind is None and stage.distance is None:
             continue
         arrays = task_stage.single(stage, drawings)
         for each in uniforms:
@@ -45,6 +46,10 @@ def check(
                 check_level(stage, drawn, spacing)
             else:
                 _check_own(own, stage, drawn, spacing)
+        if stage.distance is not None:
+            _check_distance(
+                stage, [level.sample(each, arrays, spacing, np) for each in uniforms], spacing
+            )
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
@@ -67,6 +72,23 @@ def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spa
     problem = _problem(extended.redraw(own, drawn), spacing, ("robot", "wall"), ("wall",))
     if problem:
         raise ConfigError(f"{extended.label(own)}, drawn for stage {stage.name}: {problem}.")
+
+
+def _check_distance(stage: StageConfig, levels: Sequence[Level], spacing: Spacing) -> None:
+    """Refuses a distance at which a robot has arrived, or that no level has."""
+    least = round(spacing.target_radius + MARGIN, 4)
+    ends = np.array(stage.distance_units)
+    if ends[0] < round_up(least):
+        raise ConfigError(
+            f"stage {stage.name}: distance is {show(stage.distance)}, but a robot arrives within "
+            f"{spacing.target_radius:g} m of its target: give at least {least:g}."
+        )
+    sizes = spacing.hull_radius, spacing.target_radius
+    if not any((ways.starts(each, ends, *sizes, np)[1] & each.present).any() for each in levels):
+        raise ConfigError(
+            f"stage {stage.name}: distance is {show(stage.distance)}, but in {_TRIED} levels no "
+            "robot has a way of this length to its target: give less."
+        )
 
 
 def _problem(

@@ -32,6 +32,8 @@ class Stage(NamedTuple):
       drawing: 1 + index of the extension drawing of the stage's levels, 0 for none, int32.
       map: the maps; None if no stage has one.
       layouts: numbers of the stages' layouts, by kind; None if no stage has one.
+      distance: smallest and largest way from start to target, [2] units, int32; 0 for any; None
+        if no stage has one.
       laid_out: true if all stages have a layout; None if any stage has none.
     """
 
@@ -45,6 +47,7 @@ class Stage(NamedTuple):
     drawing: Array
     map: MapArrays | None = None
     layouts: dict[Kind, LayoutArrays] | None = None
+    distance: Array | None = None
     laid_out: Array | None = None
 
 
@@ -70,6 +73,9 @@ def stack(stages: Sequence[StageConfig], drawings: Sequence[LevelDrawing] = ()) 
         drawing=np.array([_drawing(s, names) for s in stages], np.int32),
         map=maps.stack([stage.drawn_map for stage in stages]),
         layouts=drawing.stack([stage.laid_out for stage in stages]) or None,
+        distance=np.array([stage.distance_units for stage in stages], np.int32)
+        if any(stage.distance for stage in stages)
+        else None,
         laid_out=np.ones(len(stages), bool) if all(s.laid_out for s in stages) else None,
     )
 
@@ -81,16 +87,17 @@ def single(stage: StageConfig, drawings: Sequence[LevelDrawing] = ()) -> Stage:
 
 def select(stages: Stage, index: Array) -> Stage:
     """Picks stages [...] by index [...] out of [S]."""
-    *fields, drawn, layouts, laid_out = stages
+    *fields, drawn, layouts, distance, laid_out = stages
     drawn = None if drawn is None else MapArrays(*(field[index] for field in drawn))
     if layouts is not None:
         layouts = {
             kind: LayoutArrays(*(field[index] for field in arrays))
             for kind, arrays in layouts.items()
         }
+    distance = None if distance is None else distance[index]
     laid_out = None if laid_out is None else laid_out[index]
     values = (field[index] for field in fields)
-    return Stage(*values, map=drawn, layouts=layouts, laid_out=laid_out)
+    return Stage(*values, map=drawn, layouts=layouts, distance=distance, laid_out=laid_out)
 
 
 def largest_half(stages: Sequence[StageConfig]) -> float:

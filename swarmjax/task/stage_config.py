@@ -76,6 +76,12 @@ class StageConfig(Section):
     side: float | tuple[float, float] = field(
         metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 4.0)
     )
+    distance: _Length = setting(
+        None,
+        "way from start to target round walls, m, or a range; null: as the level has it",
+        0.05,
+        50.0,
+    )
     obstacles: int = setting(0, "obstacles; set by a layout", 0, _MOST_OBSTACLES)
     obstacle_size: float = setting(0.10, "edge of the square boxes of a random level, m", 0.02, 0.3)
     level: str = setting(
@@ -136,6 +142,11 @@ class StageConfig(Section):
             return
         if isinstance(self.side, tuple):
             raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
+        if self.distance is not None:
+            raise ConfigError(
+                f"distance is {show(self.distance)}, but level is fixed, whose starts are given: "
+                "leave distance out."
+            )
         most = {
             "robots": fixed_level.most_robots(self.side),
             "obstacles": len(fixed_level.BOXES),
@@ -211,6 +222,12 @@ class StageConfig(Section):
     def drawn_map(self) -> maps.Map | None:
         """The stage's map; None without one."""
         return _read_map(self.map, self.cell) if self.map else None
+
+    @property
+    def distance_units(self) -> tuple[int, int]:
+        """The smallest and the largest way from start to target, units; 0 for any."""
+        low, high = _ends(self.distance or 0.0)
+        return round(low * UNITS), round(high * UNITS)
 
     @property
     def sides(self) -> tuple[float, float]:

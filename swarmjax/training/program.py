@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from swarmjax import extension
-from swarmjax.curriculum import stages
+from swarmjax.curriculum import axes, stages
 from swarmjax.curriculum.config import PROMOTING
 from swarmjax.curriculum.engine import NEVER, Schedule
 from swarmjax.ppo.networks import Sizes
@@ -121,6 +121,7 @@ def schedule(config: ProgramConfig) -> Schedule:
         threshold=np.float32(options.threshold),
         floor=np.float32(options.floor),
         cohort_updates=np.int32(math.ceil(config.task.step_limit / config.algo.rollout_length)),
+        easier=axes.easier(options.axes, len(config.stage)),
     )
 
 

@@ -14,7 +14,7 @@ from curricula import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmjax.curriculum import engine, stages
+from swarmjax.curriculum import axes, engine, stages
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
@@ -204,6 +204,63 @@ def test_adaptive_waits_for_the_end_of_a_cohort() -> None:
     verdict = _verdict(fast, judged=False, fast=fast)
     found = _choose(ADAPTIVE, state, _schedule(2), verdict, 3)
     assert int(found.reason) == STAYED
+
+
+# --- the frontier
+
+FRONTIER = CurriculumConfig(mode="frontier", floor=0.1)
+# Two axes of two and three values. Stage 3 i + j has value i of the first and j of the second.
+GRID = axes.easier({"robots": (2.0,), "distance": (0.1, 0.2)}, 6)
+
+
+def _front(fast: list[float], weights: list[float], **more: Any) -> StageChoice:
+    numbers = _schedule(len(fast), easier=GRID)
+    state = _state(0, len(fast), weights=weights)
+    return _choose(FRONTIER, state, numbers, _verdict([0.5] * len(fast), fast=fast, **more), 3)
+
+
+@pytest.mark.parametrize(
+    ("fast", "front", "learned"),
+    [
+        ([NAN] * 6, [0], []),
+        ([0.7, NAN, NAN, NAN, NAN, NAN], [0], []),
+        ([0.8, NAN, NAN, NAN, NAN, NAN], [1, 3], [0]),
+        # Stage 4 opens once both of its easier neighbours are learned.
+        ([0.9, 0.9, 0.1, 0.2, 0.0, 0.0], [2, 3], [0, 1]),
+        ([0.9, 0.9, 0.1, 0.9, 0.0, 0.0], [2, 4], [0, 1, 3]),
+        # Failure narrows: stage 0 is practised again, and what stage 1 opened is closed.
+        ([0.5, 0.9, 0.1, 0.1, 0.1, 0.1], [0, 2], [1]),
+        ([0.9] * 5 + [0.3], [5], [0, 1, 2, 3, 4]),
+        # The last stage stays in training.
+        ([0.9] * 6, [5], [0, 1, 2, 3, 4]),
+        # A stage beyond the frontier may be learned by chance.
+        ([0.5, NAN, NAN, NAN, NAN, 0.9], [0], [5]),
+    ],
+)
+def test_the_frontier_is_open_and_not_learned(
+    fast: list[float], front: list[int], learned: list[int]
+) -> None:
+    found = _front(fast, [0.0] * 6)
+    expected = np.full(6, 0.1 / 6)
+    expected[front] += 0.9 * (0.8 if learned else 1.0) / len(front)
+    expected[learned] += 0.9 * 0.2 / max(len(learned), 1)
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
+    assert int(found.reason) == REWEIGHED
+
+
+def test_the_frontier_decides_nothing_within_a_cohort_or_without_a_change() -> None:
+    learned, old = [0.9] + [0.0] * 5, [0.5] * 2 + [0.0] * 4
+    found = _front(learned, old, over=False)
+    assert (found.weights.tolist(), int(found.reason)) == (old, STAYED)
+    again = _front(learned, _front(learned, old).weights.tolist())
+    assert int(again.reason) == STAYED
+
+
+def test_a_sequence_of_stages_opens_one_by_one() -> None:
+    verdict = _verdict([0.5] * 3, fast=[0.9, 0.1, NAN])
+    found = _choose(FRONTIER, _state(0, 3), _schedule(3), verdict, 3)
+    np.testing.assert_allclose(found.weights, [0.18 + 0.1 / 3, 0.72 + 0.1 / 3, 0.1 / 3], rtol=1e-6)
+    assert int(found.stage) == 1
 
 
 SHARES = st.lists(st.one_of(st.just(NAN), st.floats(0.0, 1.0, width=32)), min_size=1, max_size=40)

@@ -164,7 +164,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[{robots: 2, side: 1}]"], "stage.name is missing and has "
          "no default: give it."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
-         "robots, side, obstacles, obstacle_size, level, layout, map, cell, breadth, gap, width, "
+         "robots, side, distance, obstacles, obstacle_size, level, layout, map, cell, breadth, gap, width, "
          "depth, length, radius, apart, cells."),
         (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
@@ -188,7 +188,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),
         (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give one of sequential, "
-         "mixed, adaptive, or extensions=FILE, a file that defines it."),
+         "mixed, adaptive, frontier, or extensions=FILE, a file that defines it."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
          "than 0, at most 1."),
         (["stage=s6", "stage.side=5"], "stage.side is 5: give 0.4 to 4."),
@@ -205,7 +205,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["curriculum.score=failure"], "curriculum.score is failure, but mode is mixed: score is "
          "an option of adaptive, so give learnability or mode=adaptive."),
         (["curriculum.mode=mixed", "curriculum.floor=0.2"], "curriculum.floor is 0.2, but mode is "
-         "mixed: floor is an option of adaptive, so give 0.1 or mode=adaptive."),
+         "mixed: floor is an option of adaptive and frontier, so give 0.1 or mode=adaptive."),
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
          "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
          "keep or mode=sequential."),

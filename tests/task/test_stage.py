@@ -28,8 +28,8 @@ def test_stack() -> None:
         fence=np.array([False, False, True, False]),
         drawing=np.zeros(4, np.int32),
     )
-    assert found.map is found.layouts is found.laid_out is None
-    for mine, theirs in zip(found[:-3], expected[:-3], strict=True):
+    assert found.map is found.layouts is found.distance is found.laid_out is None
+    for mine, theirs in zip(found[:-4], expected[:-4], strict=True):
         assert mine.dtype == theirs.dtype
         np.testing.assert_array_equal(mine, theirs)
 

@@ -1,0 +1,92 @@
+"""Curricula along axes: a stage, and easier values of its numbers, become a grid of stages.
+
+With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
+an axis is the stage's own, so the last stage is the stage itself. Stages count the first axis
+slowest.
+"""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from swarmjax.config import ConfigError, show
+from swarmjax.task.layouts.site import NUMBERS
+from swarmjax.task.stage_files import complete
+
+AXES = ("robots", "side", "distance", "obstacles", "obstacle_size", "breadth", "cells", *NUMBERS)
+MOST_STAGES = 64  # of a grid; each has its own record and its own column in the log
+
+
+def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Makes the stages of a grid.
+
+    Args:
+      stage: plain data of the goal.
+      axes: values of each axis, from easy to hard, without the stage's own.
+
+    Returns:
+      Plain data of the stages; the last is the goal.
+
+    Raises:
+      ConfigError: an axis is unknown, empty or ends at the stage's own value, or the grid is too
+        large.
+    """
+    for key, values in axes.items():
+        _check(stage, key, values)
+    columns = [[*values, stage.get(key)] for key, values in axes.items()]
+    count = math.prod(map(len, columns))
+    if count > MOST_STAGES:
+        raise ConfigError(
+            f"curriculum.axes makes {count} stages, with the stage's own values: give values for "
+            f"at most {MOST_STAGES}."
+        )
+    grid = []
+    for values in itertools.product(*columns):
+        own = dict(zip(axes, values, strict=True))
+        name = "-".join(f"{key}{_written(value)}" for key, value in own.items())
+        grid.append(complete({**stage, **own, "name": f"{stage['name']}-{name}"}))
+    return [*grid[:-1], dict(stage)]
+
+
+def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
+    """Refuses an axis that is unknown, empty, or ends at the stage's own value."""
+    if key not in AXES:
+        raise ConfigError(f"curriculum.axes.{key} is no axis: give one of {', '.join(AXES)}.")
+    if not isinstance(values, Sequence) or isinstance(values, str) or not values:
+        raise ConfigError(
+            f"curriculum.axes.{key} is {show(values)}: give a list of values from easy to hard, "
+            "without the stage's own."
+        )
+    if stage.get(key) in values:
+        raise ConfigError(
+            f"curriculum.axes.{key} is {show(values)}, but stage.{key} is "
+            f"{show(stage[key])}: leave the stage's own value out; it comes last by itself."
+        )
+
+
+def _written(value: Any) -> str:
+    """Writes a value as part of a stage's name, such as 0p15 or 0p1to0p2."""
+    if value is None:
+        return "any"
+    ends = value if isinstance(value, Sequence) else [value]
+    return "to".join(f"{end:g}" for end in ends).replace(".", "p").replace("-", "m")
+
+
+def easier(axes: Mapping[str, Sequence[Any]], stages: int) -> np.ndarray:
+    """Returns which stages have to be learned before each stage opens.
+
+    Args:
+      axes: `curriculum.axes`; empty if the stages are a sequence.
+      stages: S.
+
+    Returns:
+      [S, S] bool; entry (i, j) is true if stage j is one step easier than stage i on one axis. In a
+      sequence, that is the stage before.
+    """
+    sizes = [len(values) + 1 for values in axes.values()] or [stages]
+    place = np.stack(np.unravel_index(np.arange(stages), sizes), axis=-1)
+    ahead = place[:, None] - place[None]
+    return (ahead >= 0).all(axis=-1) & (ahead.sum(axis=-1) == 1)

@@ -1,0 +1,236 @@
+"""Places starts at a given way from their targets, along the shortest path round walls.
+
+Every lattice point has a shortest way to the target, through corners of a visibility graph
+(Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
+Obstacles"). A point with a longer way than wanted moves along its first straight leg, until the
+rest is as long as wanted. All lengths are integers, so NumPy and JAX choose the same starts.
+
+Walls are widened as in `geodesic.py`. Ways turn at the corners of walls only. Among turned boxes,
+a start therefore sees its target past the squares around the boxes, and its way is straight.
+
+Axes: R robots, M obstacles, K = 4 M corners, P lattice points. Lengths are units of 1/4096 m.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from swarmjax.sim import noise
+from swarmjax.sim.noise import Stream
+from swarmjax.task.layouts.site import pick
+from swarmjax.task.placement import (
+    FORBIDDEN,
+    UNITS,
+    choose,
+    clearance,
+    fold,
+    gaps_of,
+    lattice,
+    score_rectangles,
+    score_things,
+    score_walls,
+    units,
+)
+
+Array = Any
+
+# Shares of the hull's radius, as in `geodesic.py`: walls are widened by the first, and corners are
+# set off by the second.
+_WIDENED, _CORNER = 0.8, 0.9
+_NO_WAY = 2**29  # length of a way that does not exist; an int32 holds the sum of two
+# Lines of sight are tested in units of 1/1024 m, so that an int32 holds products of lengths. The
+# error of 1 mm is a quarter of the distance between a corner and its widened wall.
+_COARSE = 2
+_SQUARE = np.float32(1.41422)  # half edge of the square around a turned square of half edge 1
+_OTHER = 2**27  # subtracted from the score of a start with another way; soft scores are less
+_SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.int32)
+
+
+class Plan(NamedTuple):
+    """The lattice of a level, and the straight legs between its points, corners and targets.
+
+    Attributes:
+      points: [P, 2] lattice points.
+      corner: [K, 2] corners of the widened walls.
+      target: [R, 2].
+      to_corner: [P, K] lengths of legs from points to corners; here and below, `_NO_WAY` if barred.
+      to_target: [P, R] lengths of legs from points to targets.
+      to_go: [R, K] ways from the corners to the targets.
+    """
+
+    points: Array
+    corner: Array
+    target: Array
+    to_corner: Array
+    to_target: Array
+    to_go: Array
+
+
+def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> tuple[Array, Array]:
+    """Chooses starts from which the ways to the targets have a given length.
+
+    Starts keep the distances of `gaps_of` from each other and from the targets of other robots. A
+    robot that finds no such start gets one with another way.
+
+    Args:
+      level: the level as drawn, a `level.Level`.
+      distance: [2] smallest and largest way, units. A level draws one way for all of its robots.
+      hull: radius of the robots, m.
+      reach: radius of the arrival zone, m.
+      xp: `numpy` or `jax.numpy`; both choose the same starts.
+
+    Returns:
+      [R, 2] x and y of the starts, units, and [R] whether their ways have the drawn length.
+    """
+    side, rectangle = units(level.side, xp), _rectangles(level, xp)
+    number = xp.arange(len(level.target))
+    drawn = noise.uniform(level.seed, 0, Stream.WAY, (3 + len(number),), xp)
+    way = pick(drawn[0], distance[0], distance[1], xp)
+    plan = _plan(level, lattice(drawn[1:3], side, xp), rectangle, hull, xp)
+    gaps, clear = gaps_of(hull, reach), clearance(hull)
+
+    def step(placed: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        robot, there = row
+        candidates, has_way, exists = _candidates(plan, robot, way, gaps.from_target.hard, xp)
+        others = level.present & (number != robot)
+        score = [
+            xp.where(exists, 0, FORBIDDEN),
+            score_walls(candidates, side, clear, xp),
+            score_rectangles(candidates, rectangle, level.obstacle_present, clear, xp),
+            score_things(candidates, plan.target, others, gaps.from_target, xp),
+            score_things(candidates, placed[:, :2], placed[:, 2] > 0, gaps.start, xp),
+        ]
+        score = xp.min(xp.stack(score), axis=0) - xp.where(has_way, 0, _OTHER)
+        best = choose(score, drawn[3 + robot], xp)
+        mine = (number == robot) & there
+        start = xp.concatenate([candidates[best], xp.ones(1, xp.int32)])
+        placed = xp.where(mine[:, None], start, placed)
+        return placed, (candidates[best], score[best] > -_OTHER)
+
+    nobody = xp.zeros((len(number), 3), xp.int32)
+    return fold(step, nobody, (number, level.present), xp, unroll=1)
+
+
+def _candidates(
+    plan: Plan, robot: Array, way: Array, least: int, xp: Any
+) -> tuple[Array, Array, Array]:
+    """Lists possible starts of a robot: points moved along their ways, and the points themselves.
+
+    Returns:
+      The starts [2 P, 2], whether they have the way, and whether they have any way of at least
+      `least`.
+    """
+    place = xp.concatenate([plan.target[robot][None], plan.corner])
+    legs = xp.concatenate([plan.to_target[:, robot][:, None], plan.to_corner], axis=1)
+    to_go = xp.concatenate([xp.zeros(1, xp.int32), plan.to_go[robot]])
+    first = xp.argmin(legs + to_go, axis=-1)
+    leg = xp.take_along_axis(legs, first[:, None], axis=1)[:, 0]
+    length = leg + to_go[first]
+    excess = xp.clip(length - way, 0, leg)
+    away = place[first] - plan.points
+    moved = (
+        plan.points + (away * excess[:, None] + leg[:, None] // 2) // xp.maximum(leg, 1)[:, None]
+    )
+    has_way = (length < _NO_WAY) & (length - excess == way)
+    return (
+        xp.concatenate([moved, plan.points]),
+        xp.concatenate([has_way, xp.zeros_like(has_way)]),
+        xp.concatenate([has_way, (length < _NO_WAY) & (length >= least)]),
+    )
+
+
+def _rectangles(level: Any, xp: Any) -> Array:
+    """Returns obstacles [M, 4] as axis-aligned rectangles: the squares around turned boxes."""
+    half = level.obstacle[:, 3:]
+    half = xp.where(level.obstacle[:, 2:3] != 0.0, half * _SQUARE, half)
+    return units(xp.concatenate([level.obstacle[:, :2], half], axis=-1), xp)
+
+
+def _plan(level: Any, points: Array, rectangle: Array, hull: float, xp: Any) -> Plan:
+    """Measures all legs, and the shortest ways from the corners."""
+    there, target = level.obstacle_present, units(level.target, xp)
+    off, widened = round(_CORNER * hull * UNITS), round(_WIDENED * hull * UNITS)
+    corner = rectangle[:, None, :2] + _SIGNS * (rectangle[:, None, 2:] + off)
+    corner = corner.reshape(-1, 2)
+    usable = xp.repeat(there & (level.obstacle[:, 2] == 0.0), len(_SIGNS))
+    usable &= xp.max(xp.abs(corner), axis=-1) <= units(level.side, xp) // 2 - widened
+
+    def legs(begin: Array, end: Array) -> Array:
+        return _legs(begin, end, rectangle, there, widened, xp)
+
+    between = xp.where(usable[:, None] & usable, legs(corner, corner), _NO_WAY)
+    direct = xp.where(usable, legs(target, corner), _NO_WAY)
+    return Plan(
+        points=points,
+        corner=corner,
+        target=target,
+        to_corner=legs(points, corner),
+        to_target=legs(points, target),
+        to_go=_settle(direct, between, xp),
+    )
+
+
+def _settle(to_go: Array, between: Array, xp: Any) -> Array:
+    """Shortens ways [R, K] by legs between corners [K, K] until no way gets shorter."""
+
+    def shorten(to_go: Array) -> Array:
+        # One Bellman-Ford step allows ways with one more corner.
+        further = xp.min(between + to_go[:, None, :], axis=-1, initial=_NO_WAY)
+        return xp.minimum(to_go, further)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        shorter = shorten(state[0])
+        return shorter, xp.any(shorter < state[0])
+
+    state = (to_go, xp.asarray(True))
+    if xp is not np:
+        from jax import lax  # evaluations draw levels without JAX
+
+        return lax.while_loop(lambda state: state[1], step, state)[0]
+    while state[1]:
+        state = step(state)
+    return state[0]
+
+
+def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int, xp: Any) -> Array:
+    """Measures straight legs [B, E] from points to others; `_NO_WAY` where a wall bars them.
+
+    The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
+    """
+    a, b = begin[:, None] >> _COARSE, end[None] >> _COARSE
+    middle, across = a + b, b - a  # twice the middle of the leg; the leg
+    half = (rectangle[:, 2:] + widened) >> (_COARSE - 1)  # twice the half edges
+    centre = rectangle[:, :2] >> (_COARSE - 1)
+
+    def is_barred(i: Array, barred: Array) -> Array:
+        x, y = middle[..., 0] - centre[i, 0], middle[..., 1] - centre[i, 1]
+        along_x, along_y = xp.abs(across[..., 0]), xp.abs(across[..., 1])
+        turned = xp.abs(x * across[..., 1] - y * across[..., 0])
+        meets = (xp.abs(x) < half[i, 0] + along_x) & (xp.abs(y) < half[i, 1] + along_y)
+        meets &= turned < half[i, 0] * along_y + half[i, 1] * along_x
+        return barred | (meets & there[i])
+
+    barred = _loop(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
+    away = end[None] - begin[:, None]
+    # Squares of distances to parking places may overflow; nobody goes there.
+    square = xp.maximum(xp.sum(away * away, axis=-1, dtype=xp.int32), 0)
+    return xp.where(barred, _NO_WAY, _root(square, xp))
+
+
+def _loop(count: int, step: Callable[[Array, Array], Array], state: Array, xp: Any) -> Array:
+    """Calls `step` for each number below `count`; unrolled, XLA takes minutes to compile it."""
+    if xp is not np:
+        from jax import lax  # evaluations draw levels without JAX
+
+        return lax.fori_loop(0, count, step, state)
+    for i in range(count):
+        state = step(i, state)
+    return state
+
+
+def _root(square: Array, xp: Any) -> Array:
+    """Returns the integer part of the square root, which rounding of `sqrt` does not change."""
+    root = xp.floor(xp.sqrt(square.astype(xp.float32))).astype(xp.int32)
+    root = root - (root * root > square)
+    return root + ((root + 1) * (root + 1) <= square)
