@@ -29,7 +29,7 @@ from jax import Array
 
 from benchmarks import lines, timing
 from swarmjax import command
-from swarmjax.curriculum.engine import Next, Schedule
+from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -140,7 +140,7 @@ def environment(
     def rolled(arenas: rollout.Arena, key: Array) -> tuple[Any, Any]:
         level_key, key = jax.random.split(key)
         index = jnp.zeros((1, program.config.arenas), jnp.int32)
-        starts = rollout.draw_starts(world, schedule.stages, Next(index), jnp.int32(0), level_key)
+        starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 

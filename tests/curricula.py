@@ -16,5 +16,5 @@ def observe(
     options: CurriculumConfig, numbers: Schedule, state: CurriculumState, ended: Ended, number: int
 ) -> CurriculumState:
     """Ends an update with this number, in which these episodes ended."""
-    own, loss = stages.make(numbers, options), jnp.zeros(ended.cohort.shape)
-    return engine.observe(own, numbers, options.success, state, ended, loss, jnp.int32(number))
+    own = stages.make(numbers, options)
+    return engine.observe(own, numbers, options.success, state, ended, jnp.int32(number))

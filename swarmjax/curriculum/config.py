@@ -74,12 +74,6 @@ class CurriculumConfig(Section):
     exploration: Literal["keep", "reset"] = setting(
         "keep", "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
     )
-    levels: Literal["none", "learnability", "value_loss"] = setting(
-        "none",
-        "levels to replay; none: a new level every episode; learnability: those with the "
-        "largest p (1 - p), where p is their success; value_loss: those with the largest "
-        "positive value loss",
-    )
 
     def _check(self) -> None:
         check_options(self, _READ_BY)

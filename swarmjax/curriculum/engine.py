@@ -1,8 +1,7 @@
 """The protocol of a curriculum, and how success is measured for every curriculum.
 
-A curriculum chooses the stage and the level of the next episodes, and observes how episodes ended.
-Both are pure functions of its own state, on the device. `stages.py` has the built-in modes, and
-`levels.py` replays levels of any of them.
+A curriculum chooses the stages of the next episodes, and observes how episodes ended. Both are pure
+functions of its own state, on the device. `stages.py` has the built-in modes.
 
 Success is measured on each stage, without favouring short episodes. A cohort holds all episodes
 that began within one step limit. The verdict on a cohort comes one step limit after that, when the
@@ -78,21 +77,6 @@ class StageChoice(NamedTuple):
     stage: Array
     weights: Array
     reason: Array
-
-
-class Next(NamedTuple):
-    """The next episodes of each arena, [W, A].
-
-    Attributes:
-      stage: stage on which the episode begins, int32.
-      level: seed of the episode's level, uint32; None: a new level for each episode.
-      replayed: whether the level was played before, so that the episode does not count for its
-        stage; None: it was not.
-    """
-
-    stage: Array
-    level: Array | None = None
-    replayed: Array | None = None
 
 
 class CohortTally(NamedTuple):
@@ -181,13 +165,11 @@ class CurriculumOutcomes(NamedTuple):
 
     Attributes:
       ended: [T, A] episodes that ended, of all devices.
-      value_loss: [T, A] mean of max(advantage, 0) over the episode's transitions in this update.
       verdict: what the cohorts show so far.
       update: [] number of the finished update, int32.
     """
 
     ended: Ended
-    value_loss: Array
     verdict: CohortVerdict
     update: Array
 
@@ -198,12 +180,13 @@ class Curriculum(NamedTuple):
     Attributes:
       init: returns its state before the first update. The field `chosen` of a state is a
         `StageChoice`.
-      choose: (state, key, free) -> `Next`; free is (W, A), and the key is the same on all devices.
+      choose: (state, key, free) -> [W, A] stage on which the next episodes of each arena begin,
+        int32; free is (W, A), and the key is the same on all devices.
       observe: (state, outcomes) -> state.
     """
 
     init: Callable[[], Any]
-    choose: Callable[[Any, Array, tuple[int, int]], Next]
+    choose: Callable[[Any, Array, tuple[int, int]], Array]
     observe: Callable[[Any, CurriculumOutcomes], Any]
 
 
@@ -241,34 +224,12 @@ def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
     return CurriculumState(own=own, cohorts=cohorts, met=_robots(own.chosen, schedule))
 
 
-def choose(
-    curriculum: Curriculum, state: CurriculumState, key: Array, free: tuple[int, int]
-) -> tuple[Next, Array]:
-    """Chooses the next episodes of all arenas, on all devices alike.
-
-    Args:
-      curriculum: the curriculum.
-      state: its state.
-      key: random key, the same on all devices.
-      free: W, how many episodes wait for each arena, and A.
-
-    Returns:
-      The episodes [W, A], and the cohort [W, A] for which each counts.
-    """
-    following = curriculum.choose(state.own, key, free)
-    cohort = jnp.broadcast_to(state.cohorts.number, free)
-    if following.replayed is not None:
-        cohort = jnp.where(following.replayed, UNCOUNTED, cohort)
-    return following, cohort
-
-
 def observe(
     curriculum: Curriculum,
     schedule: Schedule,
     success: Success,
     state: CurriculumState,
     ended: Ended,
-    value_loss: Array,
     update: Array,
     shards: Shards = ALONE,
 ) -> CurriculumState:
@@ -282,7 +243,6 @@ def observe(
       success: the deciding success.
       state: its state.
       ended: [T, A] episodes that ended, of this device.
-      value_loss: [T, A] mean of max(advantage, 0) over the episode's transitions in this update.
       update: [] number of the finished update, from 0.
       shards: how the arenas are spread over devices.
 
@@ -291,9 +251,8 @@ def observe(
     """
     counted = count(state.cohorts, ended, shards)
     judged, verdict = conclude(counted, schedule.cohort_updates, success)
-    every, loss = jax.tree.map(partial(shards.gather, axis=1), (ended, value_loss))
-    outcomes = CurriculumOutcomes(every, loss, verdict, update)
-    own = curriculum.observe(state.own, outcomes)
+    every = jax.tree.map(partial(shards.gather, axis=1), ended)
+    own = curriculum.observe(state.own, CurriculumOutcomes(every, verdict, update))
     return CurriculumState(
         own=own,
         cohorts=begin_cohort(judged, verdict.over | (own.chosen.reason != STAYED)),

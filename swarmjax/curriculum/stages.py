@@ -14,7 +14,6 @@ from flax import struct
 from jax import Array
 
 from swarmjax.config.foreign_code import explained
-from swarmjax.curriculum import levels
 from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import (
     BY_BUDGET,
@@ -24,7 +23,6 @@ from swarmjax.curriculum.engine import (
     CohortVerdict,
     Curriculum,
     CurriculumOutcomes,
-    Next,
     Record,
     Schedule,
     StageChoice,
@@ -72,17 +70,13 @@ def make(
     """
     piece = {each.name: each for each in own}.get(options.mode)
     if piece is None:
-        by_stage = _of_mode(schedule, options)
-    else:
-        guard = explained(f"{extended.label(piece)} fails")
-        by_stage = Curriculum(*map(guard, guard(piece.function)(schedule)))
-    if options.levels == "none":
-        return by_stage
-    return levels.make(by_stage, schedule.deadline.shape[0], options)
+        return _of_mode(schedule, options)
+    guard = explained(f"{extended.label(piece)} fails")
+    return Curriculum(*map(guard, guard(piece.function)(schedule)))
 
 
 def _of_mode(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
-    """Makes a built-in curriculum over stages, which chooses no levels."""
+    """Makes a built-in curriculum."""
     mode, stages = MODES[options.mode], schedule.deadline.shape[0]
 
     def init() -> StagesState:
@@ -92,8 +86,8 @@ def _of_mode(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
         chosen = mode(blank, schedule, options, no_verdict(stages), zero - 1)
         return replace(blank, chosen=chosen)
 
-    def choose(state: StagesState, key: Array, free: tuple[int, int]) -> Next:
-        return Next(jnp.tile(assign(state.chosen.weights, state.turn, free[1]), (free[0], 1)))
+    def choose(state: StagesState, key: Array, free: tuple[int, int]) -> Array:
+        return jnp.tile(assign(state.chosen.weights, state.turn, free[1]), (free[0], 1))
 
     def observe(state: StagesState, outcomes: CurriculumOutcomes) -> StagesState:
         verdict = outcomes.verdict

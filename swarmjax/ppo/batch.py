@@ -132,28 +132,6 @@ def make(
     )
 
 
-def value_loss(batch: Batch, over: jax.Array) -> jax.Array:
-    """Computes the positive value loss of each episode, over its transitions in a rollout.
-
-    Args:
-      batch: [L] batches, each of A groups with T N samples.
-      over: [T, A], whether an arena's episode ended with the step.
-
-    Returns:
-      [T, A] mean of max(advantage, 0) over the transitions since the last end of an episode.
-    """
-
-    def by_step(x: jax.Array) -> jax.Array:
-        return jnp.sum(x.reshape(*x.shape[:2], len(over), -1), axis=(0, 3)).T
-
-    positive = by_step(jnp.where(batch.valid, jnp.maximum(batch.advantage, 0.0), 0.0))
-    valid = by_step(batch.valid.astype(jnp.float32))
-    # Sums over the steps before are sums over the steps after, with time reversed.
-    begins = jnp.concatenate([jnp.ones_like(over[:1]), over[:-1]])
-    total, count = (sum_back(x[::-1], begins[::-1], 1.0)[::-1] for x in (positive, valid))
-    return total / jnp.maximum(count, 1.0)
-
-
 def generalized_advantages(
     rewards: jax.Array,
     values: jax.Array,

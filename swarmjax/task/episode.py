@@ -59,7 +59,6 @@ class Ended(NamedTuple):
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
       broken: 1 where the episode ended because the physics was no longer finite.
-      level: seed of the level, uint32; None if the curriculum chooses no levels.
       robots: results per robot, if `run.episodes` asks for them.
     """
 
@@ -75,5 +74,4 @@ class Ended(NamedTuple):
     contacts: Array
     reward: Array
     broken: Array
-    level: Array | None = None
     robots: Robots | None = None

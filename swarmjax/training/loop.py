@@ -14,7 +14,6 @@ from jax import Array
 
 from swarmjax.curriculum import engine
 from swarmjax.curriculum.engine import BY_BUDGET, BY_THRESHOLD, CurriculumState, Schedule
-from swarmjax.ppo import batch as batches
 from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import Shards
@@ -115,10 +114,9 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     explored = program.ppo.explore(state.learners, steps)
     learn_keys = jax.random.split(learn_key, trajectory.valid.shape[1])
     learners, learned = jax.vmap(program.ppo.update)(explored, batch, learn_keys)
-    loss = batches.value_loss(batch, ended.episodes > 0)
     success = config.curriculum.success
     curriculum = engine.observe(
-        program.curriculum(schedule), schedule, success, before, ended, loss, state.update, shards
+        program.curriculum(schedule), schedule, success, before, ended, state.update, shards
     )
     learners = carry_over(learners, program, before, curriculum)
     stage, every_stage = before.chosen.stage, jnp.arange(len(schedule.deadline))[:, None]
@@ -185,15 +183,11 @@ def _draw(
 ) -> Arena:
     """Draws `waiting` episodes for each arena of this device."""
     config, shards = program.config, program.shards
-    choose_key = jax.random.fold_in(key, 1)
-    chosen = engine.choose(
-        program.curriculum(schedule), curriculum, choose_key, (waiting, config.arenas)
-    )
-    following, cohort = jax.tree.map(partial(shards.local, axis=1), chosen)
+    choose, choose_key = program.curriculum(schedule).choose, jax.random.fold_in(key, 1)
+    stage = choose(curriculum.own, choose_key, (waiting, config.arenas))
+    stage, cohort = shards.local(stage, axis=1), curriculum.cohorts.number
     memory = program.ppo.begin_memory((program.world.spacing.robots,))
-    return rollout.draw_starts(
-        program.world, schedule.stages, following, cohort, key, shards, memory
-    )
+    return rollout.draw_starts(program.world, schedule.stages, stage, cohort, key, shards, memory)
 
 
 def _curriculum_metrics(

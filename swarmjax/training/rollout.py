@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, Next, Schedule
+from swarmjax.curriculum.engine import UNCOUNTED, Curriculum, Schedule
 from swarmjax.ppo.batch import Batch, Trajectory
 from swarmjax.ppo.memory import NO_MEMORY, Recall
 from swarmjax.ppo.ppo import PPO, LearnerState
@@ -63,13 +63,11 @@ class Arena(EnvState):
       cohort: [] the curriculum's cohort in which the episode began, int32.
       recall: [R, H] memory of each robot's actor and critic before the observation; () each without
         memory.
-      seed: [] seed of the episode's level, uint32; None if the curriculum chooses no levels.
     """
 
     stage: Array
     cohort: Array
     recall: Recall = NO_MEMORY
-    seed: Array | None = None
 
 
 def to_learners(x: Array, learners: int) -> Array:
@@ -104,7 +102,7 @@ def to_arenas(x: Array) -> Array:
 def draw_starts(
     world: World,
     stages: Stage,
-    following: Next,
+    stage: Array,
     cohort: Array,
     key: Array,
     shards: Shards = ALONE,
@@ -119,36 +117,28 @@ def draw_starts(
     Args:
       world: the compiled environment.
       stages: [S].
-      following: [W, A] the episodes: the first episode of every arena, then the second, and so on.
-      cohort: [W, A] or [] cohort for which each episode counts, int32.
-      key: random key for the new levels, consumed.
+      stage: [W, A] stage of the first episode of every arena, of the second, and so on.
+      cohort: [] cohort for which the episodes count, int32.
+      key: random key for the levels, consumed.
       shards: how the arenas are spread over devices; A counts those of this device.
       memory: [R, H] memory of the robots of an arena as an episode begins.
 
     Returns:
       [W A] waiting episodes, packed.
     """
-    waiting, arenas = following.stage.shape
+    waiting, arenas = stage.shape
     count = level.uniform_count(world.spacing)
     stages = jax.tree.map(jnp.asarray, stages)
-    if following.level is None:
-        size = (waiting, arenas // shards.local_streams, count)
-        uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
-    else:
-        uniforms = jax.vmap(lambda seed: jax.random.uniform(jax.random.key(seed), (count,)))(
-            following.level.ravel()
-        )
+    size = (waiting, arenas // shards.local_streams, count)
+    uniforms = shards.draw(key, lambda key: jax.random.uniform(key, size), axis=1)
 
-    def start(uniform: Array, i: Array, cohort: Array, seed: Array | None) -> Arena:
-        stage = task_stage.select(stages, i)
-        drawn = extended.draw(uniform, stage, world.spacing, world.drawings)
+    def start(uniform: Array, index: Array) -> Arena:
+        mine = task_stage.select(stages, index)
+        drawn = extended.draw(uniform, mine, world.spacing, world.drawings)
         begun = vars(env.reset(world, drawn))
-        return Arena(**begun, stage=i, cohort=cohort, recall=memory, seed=seed)
+        return Arena(**begun, stage=index, cohort=cohort, recall=memory)
 
-    seed = None if following.level is None else following.level.ravel()
-    index = following.stage.astype(jnp.int32).ravel()
-    cohorts = jnp.broadcast_to(cohort, following.stage.shape).ravel()
-    return jax.vmap(start)(uniforms.reshape(-1, count), index, cohorts, seed)
+    return jax.vmap(start)(uniforms.reshape(-1, count), stage.astype(jnp.int32).ravel())
 
 
 def collect(
@@ -341,7 +331,6 @@ def _ended(arenas: Arena, timestep: env.TimeStep, *, by_robot: bool) -> Ended:
         contacts=mine(jnp.sum(episode.contacts, axis=-2)),
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~timestep.sound).astype(jnp.int32),
-        level=None if arenas.seed is None else mine(arenas.seed),
         robots=jax.tree.map(mine, episodes.robots(arenas)) if by_robot else None,
     )
 

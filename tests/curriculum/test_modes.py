@@ -25,7 +25,6 @@ from swarmjax.curriculum.engine import (
     STAYED,
     CohortVerdict,
     CurriculumState,
-    Next,
     Schedule,
     StageChoice,
 )
@@ -408,7 +407,7 @@ def step() -> Step:
         index: jax.Array, arenas: Arena | None, cohort: jax.Array, key: jax.Array
     ) -> tuple[Arena, Ended]:
         level_key, rollout_key = jax.random.split(key)
-        starts = draw(Next(index[None]), cohort, level_key)
+        starts = draw(index[None], cohort, level_key)
         before = starts if arenas is None else arenas
         after, _, ended = collect(learners, before, starts, rollout_key)
         return after, ended

@@ -36,7 +36,7 @@ def test_the_curriculum_of_the_guide(tmp_path: Path) -> None:
     own, schedule = _load(tmp_path / "own.py", body, "weakest")
     schedule = schedule._replace(cohort_updates=jnp.int32(1))
     state, key = engine.init(own, schedule), jax.random.key(0)
-    assert set(engine.choose(own, state, key, (4, 64))[0].stage.ravel().tolist()) == set(range(6))
+    assert set(own.choose(state.own, key, (4, 64)).ravel().tolist()) == set(range(6))
     observe = jax.jit(partial(engine.observe, own, schedule, "targets"))
     one, stage = jnp.ones((1, 6), jnp.int32), jnp.arange(6)[None]
     reached = 1 * (stage != 2)  # the third stage reaches nothing
@@ -55,7 +55,7 @@ def test_the_curriculum_of_the_guide(tmp_path: Path) -> None:
             reward=1.0 * one,
             broken=0 * one,
         )
-        state = observe(state, ended, jnp.zeros((1, 6)), jnp.int32(update))
+        state = observe(state, ended, jnp.int32(update))
         assert int(state.chosen.reason) == REWEIGHED
     expected = [1 / 12, 1 / 12, 7 / 12, 1 / 12, 1 / 12, 1 / 12]
     np.testing.assert_allclose(state.chosen.weights, expected, rtol=1e-6)  # float32

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmjax.curriculum.engine import Next, Schedule
+from swarmjax.curriculum.engine import Schedule
 from swarmjax.ppo import exploration
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
@@ -93,7 +93,7 @@ def _round(
     config, world = program.config, program.world
     key, level_key, rollout_key = jax.random.split(state.key, 3)
     index = jnp.zeros((config.waiting, 1), jnp.int32)
-    starts = rollout.draw_starts(world, schedule.stages, Next(index), jnp.int32(0), level_key)
+    starts = rollout.draw_starts(world, schedule.stages, index, jnp.int32(0), level_key)
     arenas, path, ended = rollout.collect(
         program, state.learners, state.arenas, starts, rollout_key
     )

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from entries import BEARING, DISTANCE, INFRARED, KNOWN
 
-from swarmjax.curriculum.engine import Next
 from swarmjax.run.load_settings import load_train
 from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
@@ -483,7 +482,7 @@ def real() -> Drawn:
     config = load_train([*arena, *size, "realism=real", "sim.impl=jax"])
     world, stages = programs.load_world(config), task_stage.stack(config.stage)
     draw = jax.jit(
-        functools.partial(rollout.draw_starts, world, stages, Next(jnp.zeros((1, FEW), jnp.int32)))
+        functools.partial(rollout.draw_starts, world, stages, jnp.zeros((1, FEW), jnp.int32))
     )
     starts = [draw(jnp.int32(cohort), jax.random.key(cohort)) for cohort in range(2)]
     traces = []

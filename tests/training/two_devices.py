@@ -41,8 +41,6 @@ def main(out: str, devices: str, words: str, *more: str) -> None:
     }
     found["sums"] = np.array(len(re.findall(r" all-reduce(?:-start)?\(", call.as_text())))
     found |= {f"metrics/{name}": np.asarray(values) for name, values in metrics.items()}
-    if hasattr(state.curriculum.own, "buffer"):
-        found["scores"] = np.sort(state.curriculum.own.buffer.score)
     if jax.process_index() == 0:
         np.savez(out, allow_pickle=False, **found)
 
