@@ -21,7 +21,6 @@ MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
 # Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number by 0
 # if the number is nearer to 0 than `_SMALLEST`.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
-LAST_READER = "8820a9f"  # the last commit that reads runs and policies with older keys
 
 
 class UnknownKeyError(ConfigError):
@@ -213,16 +212,15 @@ def build_stored[C: Section](cls: type[C], stored: Any, where: str) -> C:
       where: the prefix of the keys in messages.
 
     Raises:
-      ConfigError: as `build`; for a key that this version lacks, it names the last commit that
-        reads it.
+      ConfigError: as `build`; for a key that this version lacks, it says that an
+        older version may read it.
     """
     try:
         return build(cls, stored, where)
     except UnknownKeyError as error:
         key = str(error).partition(" is not a key: ")[0]
         raise ConfigError(
-            f"{key} is not a key: if an older version wrote it, {LAST_READER} is the last commit "
-            "that reads it."
+            f"{key} is not a key: if an older version wrote it, only that version reads it."
         ) from None
 
 

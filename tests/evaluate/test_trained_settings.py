@@ -136,12 +136,12 @@ def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> N
     assert _load(both, "robot.hull_radius=0.037").robot.hull_radius == 0.037
 
 
-def test_a_file_of_an_older_version_names_the_last_commit_that_reads_it() -> None:
+def test_a_file_of_an_older_version_says_what_reads_it() -> None:
     meta = policies.meta()
     meta["realism"]["dropout"] = 0.1
     assert refusal(trained_settings.trained, meta, "p.npz") == (
-        "p.npz: meta.realism.dropout is not a key: if an older version wrote it, 8820a9f is the "
-        "last commit that reads it."
+        "p.npz: meta.realism.dropout is not a key: if an older version wrote it, only "
+        "that version reads it."
     )
 
 

@@ -28,12 +28,12 @@ def test_resume_may_stop_again():
     assert load_resume(stored, ["run.stop_after=5"]).run.stop_after == 5
 
 
-def test_a_run_of_an_older_version_names_the_last_commit_that_reads_it():
+def test_a_run_of_an_older_version_says_what_reads_it():
     stored = to_dict(load_train([]))
     stored["task"]["reward"]["time"] = -0.01
     assert refusal(load_resume, stored, []) == (
-        "stored task.reward.time is not a key: if an older version wrote it, 8820a9f is the last "
-        "commit that reads it."
+        "stored task.reward.time is not a key: if an older version wrote it, only that "
+        "version reads it."
     )
 
 

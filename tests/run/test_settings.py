@@ -164,8 +164,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[{robots: 2, side: 1}]"], "stage.name is missing and has "
          "no default: give it."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
-         "robots, side, distance, obstacles, obstacle_size, level, layout, map, cell, breadth, gap, width, "
-         "depth, length, radius, apart, cells."),
+         "robots, side, distance, obstacles, obstacle_size, level, layout, map, cell, breadth, "
+         "gap, width, depth, length, radius, apart, cells."),
         (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
          "level=fixed."),
