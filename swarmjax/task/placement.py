@@ -231,6 +231,17 @@ def fold(
     return np.array(first, np.int32).reshape(-1, 2), np.array(second, bool)
 
 
+def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S:
+    """Calls `step(i, state)` for each i below `count`; XLA takes long to compile it unrolled."""
+    if xp is not np:
+        from jax import lax  # evaluations draw levels without JAX
+
+        return lax.fori_loop(0, count, step, state)
+    for i in range(count):
+        state = step(i, state)
+    return state
+
+
 def choose(score: Array, pick: Array, xp: Any) -> Array:
     """Picks uniformly among the points that score 0; without any, picks the best point."""
     rank = xp.cumsum((score >= 0).astype(xp.int32))

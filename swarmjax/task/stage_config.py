@@ -25,7 +25,7 @@ PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
-_MOST_OBSTACLES = 64
+_MOST_OBSTACLES = 112
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 _Length = float | tuple[float, float] | None
 
@@ -112,7 +112,7 @@ class StageConfig(Section):
     apart: _Length = setting(
         None, "distance between targets, or from targets to a door, m, or a range", 0.05, 1
     )
-    cells: int | None = setting(None, "cells along a maze's side", 2, 6)
+    cells: int | None = setting(None, "cells along a maze's side", 2, 8)
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):

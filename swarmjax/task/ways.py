@@ -11,7 +11,6 @@ a start therefore sees its target past the squares around the boxes, and its way
 Axes: R robots, M obstacles, K = 4 M corners, P lattice points. Lengths are units of 1/4096 m.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +26,7 @@ from swarmjax.task.placement import (
     fold,
     gaps_of,
     lattice,
+    repeat,
     score_rectangles,
     score_things,
     score_walls,
@@ -211,22 +211,11 @@ def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int
         meets &= turned < half[i, 0] * along_y + half[i, 1] * along_x
         return barred | (meets & there[i])
 
-    barred = _loop(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
+    barred = repeat(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
     away = end[None] - begin[:, None]
     # Squares of distances to parking places may overflow; nobody goes there.
     square = xp.maximum(xp.sum(away * away, axis=-1, dtype=xp.int32), 0)
     return xp.where(barred, _NO_WAY, _root(square, xp))
-
-
-def _loop(count: int, step: Callable[[Array, Array], Array], state: Array, xp: Any) -> Array:
-    """Calls `step` for each number below `count`; unrolled, XLA takes minutes to compile it."""
-    if xp is not np:
-        from jax import lax  # evaluations draw levels without JAX
-
-        return lax.fori_loop(0, count, step, state)
-    for i in range(count):
-        state = step(i, state)
-    return state
 
 
 def _root(square: Array, xp: Any) -> Array:

@@ -101,11 +101,11 @@ def test_refuses_a_text(text: str, said: str) -> None:
 
 
 def test_refuses_too_many_walls() -> None:
-    rows = ["." * 16 if r % 2 else ".#" * 8 for r in range(20)]
+    rows = ["." * 16 if r % 2 else ".#" * 8 for r in range(32)]
     rows[0] = "S." * 7 + ".T"
     said = refusal(_stage, " ".join(rows), 1)
     assert said.startswith("stage drawn: map has walls of ")
-    assert "give at most 64" in said
+    assert "give at most 112" in said
 
 
 @pytest.mark.parametrize(

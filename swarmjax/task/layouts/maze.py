@@ -15,7 +15,7 @@ from swarmjax.task.layouts.site import (
     Site,
     pick,
 )
-from swarmjax.task.placement import split
+from swarmjax.task.placement import repeat, split
 
 Array = Any
 
@@ -66,17 +66,18 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
 
 def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
     """Opens the edges of a random spanning tree, [E]."""
-    label = xp.arange(pairs.max() + 1, dtype=xp.int32)
-    ranked = xp.argsort(order, stable=True)
-    table = xp.asarray(pairs)
+    ranked, table = xp.argsort(order, stable=True), xp.asarray(pairs)
     numbers = np.arange(len(pairs))
-    open_ = xp.zeros(len(pairs), bool)
-    for i in range(len(pairs)):
+
+    def join(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        open_, label = state
         edge = ranked[i]
         one, other = label[table[edge, 0]], label[table[edge, 1]]
-        open_ = open_ | ((numbers == edge) & (one != other))
-        label = xp.where(label == other, one, label)
-    return open_
+        joins = (numbers == edge) & (one != other)
+        return open_ | joins, xp.where(label == other, one, label)
+
+    label = xp.arange(pairs.max() + 1, dtype=xp.int32)
+    return repeat(len(pairs), join, (xp.zeros(len(pairs), bool), label), xp)[0]
 
 
 def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -> Array:
@@ -84,16 +85,17 @@ def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -
 
     An edge that leads to another such cell is preferred, so that most walls remain.
     """
-    touches = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
-    for cell in range(cells * cells):
-        ways = xp.sum(open_ & touches.any(axis=-1), axis=-1, dtype=xp.int32)
-        dead = ways < 2
-        other = np.where(touches[cell, :, 0], pairs[:, 1], pairs[:, 0])
-        rank = order + dead[other].astype(xp.float32)
-        mine = touches[cell].any(axis=-1) & ~open_
-        best = xp.argmax(xp.where(mine, rank, np.float32(-1.0)))
-        open_ = open_ | (dead[cell] & (np.arange(len(pairs)) == best))
-    return open_
+    ends = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
+    touches = xp.asarray(ends.any(axis=-1))
+    others = xp.asarray(np.where(ends[..., 0], pairs[:, 1], pairs[:, 0]))  # [C, E]
+
+    def open_one(cell: Array, open_: Array) -> Array:
+        dead = xp.sum(open_ & touches, axis=-1, dtype=xp.int32) < 2
+        rank = order + dead[others[cell]].astype(xp.float32)
+        best = xp.argmax(xp.where(touches[cell] & ~open_, rank, np.float32(-1.0)))
+        return open_ | (dead[cell] & (np.arange(len(pairs)) == best))
+
+    return repeat(cells * cells, open_one, open_, xp)
 
 
 def _walls(pairs: np.ndarray, cells: int, edge: Array, corner: Array, xp: Any) -> Array:
