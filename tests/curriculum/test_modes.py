@@ -219,29 +219,31 @@ def _front(fast: list[float], weights: list[float], **more: Any) -> StageChoice:
 
 
 @pytest.mark.parametrize(
-    ("fast", "front", "learned"),
+    ("fast", "layers", "learned"),
     [
-        ([NAN] * 6, [0], []),
-        ([0.7, NAN, NAN, NAN, NAN, NAN], [0], []),
-        ([0.8, NAN, NAN, NAN, NAN, NAN], [1, 3], [0]),
+        ([NAN] * 6, [[0], [1, 3], [2, 4]], []),
+        ([0.7, NAN, NAN, NAN, NAN, NAN], [[0], [1, 3], [2, 4]], []),
+        ([0.8, NAN, NAN, NAN, NAN, NAN], [[1, 3], [2, 4], [5]], [0]),
         # Stage 4 opens once both of its easier neighbours are learned.
-        ([0.9, 0.9, 0.1, 0.2, 0.0, 0.0], [2, 3], [0, 1]),
-        ([0.9, 0.9, 0.1, 0.9, 0.0, 0.0], [2, 4], [0, 1, 3]),
+        ([0.9, 0.9, 0.1, 0.2, 0.0, 0.0], [[2, 3], [4], [5]], [0, 1]),
+        ([0.9, 0.9, 0.1, 0.9, 0.0, 0.0], [[2, 4], [5], []], [0, 1, 3]),
         # Failure narrows: stage 0 is practised again, and what stage 1 opened is closed.
-        ([0.5, 0.9, 0.1, 0.1, 0.1, 0.1], [0, 2], [1]),
-        ([0.9] * 5 + [0.3], [5], [0, 1, 2, 3, 4]),
+        ([0.5, 0.9, 0.1, 0.1, 0.1, 0.1], [[0, 2], [3], [4]], [1]),
+        ([0.9] * 5 + [0.3], [[5], [], []], [0, 1, 2, 3, 4]),
         # The last stage stays in training.
-        ([0.9] * 6, [5], [0, 1, 2, 3, 4]),
-        # A stage beyond the frontier may be learned by chance.
-        ([0.5, NAN, NAN, NAN, NAN, 0.9], [0], [5]),
+        ([0.9] * 6, [[5], [], []], [0, 1, 2, 3, 4]),
+        # A stage beyond the frontier may be learned before it opens.
+        ([0.5, NAN, NAN, NAN, 0.9, 0.0], [[0], [1, 3], [2]], [4]),
     ],
 )
 def test_the_frontier_is_open_and_not_learned(
-    fast: list[float], front: list[int], learned: list[int]
+    fast: list[float], layers: list[list[int]], learned: list[int]
 ) -> None:
     found = _front(fast, [0.0] * 6)
-    expected = np.full(6, 0.1 / 6)
-    expected[front] += 0.9 * (0.8 if learned else 1.0) / len(front)
+    ahead = np.zeros(6)
+    for share, layer in zip((0.7, 0.2, 0.1), layers, strict=True):
+        ahead[layer] += share / max(len(layer), 1)
+    expected = 0.1 / 6 + 0.9 * (0.8 if learned else 1.0) * ahead / ahead.sum()
     expected[learned] += 0.9 * 0.2 / max(len(learned), 1)
     np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
     assert int(found.reason) == REWEIGHED
@@ -258,7 +260,8 @@ def test_the_frontier_decides_nothing_within_a_cohort_or_without_a_change() -> N
 def test_a_sequence_of_stages_opens_one_by_one() -> None:
     verdict = _verdict([0.5] * 3, fast=[0.9, 0.1, NAN])
     found = _choose(FRONTIER, _state(0, 3), _schedule(3), verdict, 3)
-    np.testing.assert_allclose(found.weights, [0.18 + 0.1 / 3, 0.72 + 0.1 / 3, 0.1 / 3], rtol=1e-6)
+    expected = 0.1 / 3 + 0.9 * np.array([0.2, 0.8 * 7 / 9, 0.8 * 2 / 9])
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
     assert int(found.stage) == 1
 
 
