@@ -12,6 +12,8 @@ from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training.rollout import Program
 
+_LISTED = 12  # stages that a run names one by one
+
 
 def first(
     program: Program[TrainConfig], run: Path, kept: Kept | None, source: Kept | None
@@ -20,8 +22,12 @@ def first(
     settings, engine = program.config, program.world.physics.engine
     steps, seeds = settings.arenas * settings.algo.rollout_length, settings.numbers
     several = f", seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else ""
+    names = settings.stage_names
+    listed = ", ".join(names)
+    if len(names) > _LISTED:
+        listed = f"{names[0]} to {names[-1]}, {len(names)} stages"
     yield (
-        f"swarmjax: {settings.stage_name} ({', '.join(settings.stage_names)}), "
+        f"swarmjax: {settings.stage_name} ({listed}), "
         f"{words.count(settings.updates, 'update')} of {words.count(steps, 'arena control step')} "
         f"({words.count(settings.arenas, 'arena')}){several} on "
         f"{provenance.device()}; {settings.robot.body} robots stepped by {engine.label}, "
