@@ -21,7 +21,8 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     """
     if not _is_sequence(choice):
         return [_named(stage, choice)]
-    for key in stage.keys() - {"sequence"}:
+    _check_name(stage, choice)
+    for key in stage.keys() - {"sequence", "name"}:
         raise ConfigError(
             f"stage.{key} cannot be given for {choice}, a curriculum: choose one stage, as in "
             "stage=s6."
@@ -125,8 +126,13 @@ def name_of(choice: str) -> str:
 
 def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
     """Returns the stage named after its file, and refuses any other name."""
+    _check_name(stage, choice)
+    return complete({"name": name_of(choice), **stage})
+
+
+def _check_name(stage: dict[str, Any], choice: str) -> None:
+    """Refuses a name that is not the file's."""
     name = name_of(choice)
-    found = stage.get("name", name)
-    if found != name:
-        raise ConfigError(f"stage.name is {show(found)} in {name}.yaml: give the file's name.")
-    return complete({"name": name, **stage})
+    given = stage.get("name", name)
+    if given != name:
+        raise ConfigError(f"stage.name is {show(given)} in {name}.yaml: give the file's name.")

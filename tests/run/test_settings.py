@@ -396,3 +396,12 @@ def test_help_names_groups_and_their_choices():
         EvaluateConfig, "swarmjax.evaluate"
     )
     assert "Groups" not in help_text(ExportConfig, "swarmjax.export")
+
+
+def test_a_file_of_a_curriculum_may_have_its_name(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("name: mine\nsequence: [s1, s2]\n")
+    config = load_train([f"stage={tmp_path}/mine.yaml"])
+    assert (config.stage_name, config.stage_names) == ("mine", ["s1", "s2"])
+    (tmp_path / "mine.yaml").write_text("name: yours\nsequence: [s1, s2]\n")
+    said = refusal(load_train, [f"stage={tmp_path}/mine.yaml"])
+    assert said == "stage.name is 'yours' in mine.yaml: give the file's name."
