@@ -325,6 +325,9 @@ class Reference:
         reason = self._decide(judged, is_over, number)
         if is_over and self.options.mode == "adaptive":
             self.weights, reason = self._weights(), REWEIGHED if judged else STAYED
+        if is_over and self.options.mode == "frontier":
+            before, self.weights = self.weights, self._weights()
+            reason = STAYED if np.array_equal(before, self.weights) else REWEIGHED
         if reason in (BY_THRESHOLD, BY_BUDGET):
             self.stage += 1
             self.weights = self._weights()
@@ -353,7 +356,7 @@ class Reference:
 
     def _decide(self, judged: dict[int, np.float32], is_over: bool, number: int) -> int:
         deadline = self.numbers.deadline
-        if self.options.mode == "adaptive":
+        if self.options.mode in ("adaptive", "frontier"):
             return STAYED
         success = judged.get(self.stage) if self.cohort - 1 >= self.since else None
         if self.stage < self.stages - 1:
@@ -374,12 +377,31 @@ class Reference:
             )
             floor = np.float32(self.numbers.floor)
             return floor / self.stages + (1 - floor) * share
+        if self.options.mode == "frontier":
+            return self._frontier()
         weights = np.zeros(self.stages)
         weights[self.stage] = 1.0
         if self.options.mode == "mixed" and self.stage:
             weights[: self.stage] = EARLIER / self.stage
             weights[self.stage] = 1 - EARLIER
         return weights
+
+    def _frontier(self) -> np.ndarray:
+        """Weighs a sequence: its first stage that is not learned, and the two after that."""
+        learned = [i for i in range(self.stages - 1) if self.fast[i] >= self.numbers.threshold]
+        others = [i for i in range(self.stages) if i not in learned]
+        # A stage after a learned one is open, even if an earlier one was lost.
+        layers, passed = [], list(learned)
+        for _ in range(3):
+            layers.append([i for i in others if i not in passed and (not i or i - 1 in passed)])
+            passed += layers[-1]
+        self.stage = max(layers[0])
+        ahead = np.zeros(self.stages)
+        for share, layer in zip((0.7, 0.2, 0.1), layers, strict=True):
+            ahead[layer] += share / max(len(layer), 1)
+        weights = (0.8 if learned else 1.0) * ahead / ahead.sum()
+        weights[learned] += 0.2 / max(len(learned), 1)
+        return 0.1 / self.stages + 0.9 * weights
 
 
 Step = Callable[[jax.Array, Arena | None, jax.Array, jax.Array], tuple[Arena, Ended]]
@@ -426,6 +448,7 @@ CASES = {
     "mixed": (MIXED, {"deadline": EARLY}),
     "learnability": (ADAPTIVE, {}),
     "failure": (FAILURE, {"floor": np.float32(0.4)}),
+    "frontier": (FRONTIER, {}),
 }
 
 
@@ -449,6 +472,8 @@ def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
     decided = [reason for reason in why if reason != STAYED]
     if options.mode == "adaptive":
         assert len(decided) >= 4
+    elif options.mode == "frontier":
+        assert len(decided) >= 1
     else:
         assert decided == [BY_BUDGET, BY_THRESHOLD]
 
