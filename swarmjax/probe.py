@@ -75,6 +75,15 @@ class Counts(NamedTuple):
         """Returns how many of the episodes in a budget of control steps are such by chance."""
         return Interval(*(p * budget * self.episodes / self.steps for p in self.share(what)))
 
+    def product(self, budget: int) -> float:
+        """Returns the most episodes in a budget to expect with all robots at their targets at once.
+
+        All of them are visitors then, so the chance is at most that of one visitor to the power of
+        the number of robots, if each robot comes to its target independently of the others.
+        """
+        chance = self.share("visitors").high ** (self.robots / self.episodes)
+        return chance * budget * self.episodes / self.steps
+
 
 def interval(successes: float, trials: int) -> Interval[float]:
     """Computes a chance with its exact interval (Clopper & Pearson 1934).
@@ -189,7 +198,8 @@ def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> T
     columns = list(dict.fromkeys([settings.curriculum.success, signal]))
     table = Table(box=None if plain else box.SIMPLE)
     heads = ["stage", "robots", "episodes", *(_HEADS[each] for each in columns)]
-    for i, head in enumerate([*heads, "control steps", "paid in the budget"]):
+    more = ["at most, if independent"] if signal == "all" else []
+    for i, head in enumerate([*heads, "control steps", "paid in the budget", *more]):
         table.add_column(head, justify="right" if i else "left", no_wrap=True)
     for stage, each in zip(settings.stage, counts, strict=True):
         shares = (Interval(*(100 * p for p in each.share(what))) for what in columns)
@@ -197,7 +207,8 @@ def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> T
         found = [_number(x) for x in each.expected(signal, settings.budget)]
         expected = "{} [{}, {}]".format(*found)
         about = (stage.name, str(stage.robots), f"{each.episodes:,}")
-        table.add_row(*about, *shown, f"{each.steps / each.episodes:.0f}", expected)
+        most = [_number(each.product(settings.budget)) for _ in more]
+        table.add_row(*about, *shown, f"{each.steps / each.episodes:.0f}", expected, *most)
     return table
 
 
@@ -222,11 +233,10 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
     use = f"use a curriculum (docs/curriculum.md){first}."
     if found[-1].high < 1:
         return f"{says} fewer than {high} such episodes in the budget: {use}"
-    alone = last.share("visitors").high ** (last.robots / last.episodes)
-    alone *= settings.budget * last.episodes / last.steps
-    if signal == "all" and not last.all and alone < 1:
+    most = last.product(settings.budget)
+    if signal == "all" and not last.all and most < 1:
         return (
-            f"{says} none in {last.episodes:,} episodes, and fewer than {_number(alone)} in the "
+            f"{says} none in {last.episodes:,} episodes, and fewer than {_number(most)} in the "
             f"budget if each robot comes to its target independently of the others: {use}"
         )
     return (

@@ -61,6 +61,9 @@ def test_a_budget_holds_the_chance_times_its_episodes() -> None:
     # 1,000,000 steps are 2,500 episodes of 400.
     assert counts.expected("any", 1_000_000).estimate == pytest.approx(1250)
     assert counts.expected("all", 1_000_000).high == pytest.approx(2500 * (1 - 0.025**0.01))
+    # Three robots, each a visitor with at most the upper end of 30 of 100.
+    high = stats.binomtest(30, 100).proportion_ci(method="exact").high
+    assert counts.product(1_000_000) == pytest.approx(2500 * high**3)
 
 
 # Counting
@@ -91,8 +94,8 @@ def _ended(arena: list[list[int]], robots: Robots) -> Ended:
 
 
 def test_an_arena_that_ends_early_counts_once() -> None:
-    # Arena 0 ends after 1, 2 and 3 steps with both robots there; arena 1 after 3 steps, and its
-    # robot 0 was within its target for one of them.
+    # Arena 0 plays three episodes of one step, and both robots arrive in each. Arena 1 plays one
+    # episode of three steps, in which robot 0 leaves its target again.
     there = np.zeros((3, 2, 2), bool)
     there[:, 0] = True
     moving = np.zeros((3, 2, 2), np.int32)
@@ -227,6 +230,19 @@ def test_the_command_shows_a_row_for_each_stage(
     assert "10.0 [7.5, 13.0]" in rows[0]
     assert "50.0 [45.5, 54.5]" in rows[0]
     assert last.endswith("training on s6 alone can begin.")
+
+
+def test_with_hold_the_table_multiplies_the_chances_of_single_robots(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(probe, "probe", lambda _: [_counts(visitors=100, any=90)])
+    words = ["task.arrival=hold", "task.reward.step_penalty=0", "curriculum.success=all"]
+    assert _main(monkeypatch, "stage=s6", *words) == 0
+    _, head, row, _ = capsys.readouterr().out.splitlines()
+    assert head.rstrip().endswith("all arrive, %  control steps  paid in the budget  "
+                                  "at most, if independent")  # fmt: skip
+    assert row.split() == ["s6", "5", "500", "0.0", "[0.0,", "0.7]", "400", "0", "[0,", "55]",
+                           "3.1e-11"]  # fmt: skip
 
 
 @pytest.mark.parametrize(
