@@ -22,14 +22,15 @@ from swarmjax.export.config import ExportConfig
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.report.config import ReportConfig
 from swarmjax.reproduce.config import ReproduceConfig
-from swarmjax.run.load_settings import load_run, load_train
-from swarmjax.run.settings import TrainConfig
+from swarmjax.run.load_settings import load_as, load_run, load_train
+from swarmjax.run.settings import ProbeConfig, TrainConfig
 from swarmjax.task.stage_files import load_levels
 from swarmjax.watch.config import WatchConfig
 
 # The loader and the settings class of each command.
 COMMANDS: dict[str, tuple[Callable[[Sequence[str]], object], type[Section]]] = {
     "swarmjax.train": (load_run, TrainConfig),
+    "swarmjax.probe": (partial(load_as, ProbeConfig), ProbeConfig),
     "swarmjax.evaluate": (partial(load_levels, EvaluateConfig), EvaluateConfig),
     "swarmjax.export": (partial(files.load, ExportConfig), ExportConfig),
     "swarmjax.report": (partial(files.load, ReportConfig), ReportConfig),

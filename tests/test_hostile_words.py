@@ -18,6 +18,7 @@ from swarmjax.report.config import ReportConfig
 
 SOUND = {
     "swarmjax.train": [],
+    "swarmjax.probe": [],
     "swarmjax.evaluate": ["policy=a.npz"],
     "swarmjax.export": ["run=a"],
     "swarmjax.report": ["run=a"],
@@ -25,15 +26,17 @@ SOUND = {
     "swarmjax.reproduce": [],
     "swarmjax.watch": ["run=a"],
 }
+# The probe takes the words of `train`, with the same code.
+OTHERS = {name: cls for name, (_, cls) in COMMANDS.items() if name != "swarmjax.probe"}
 TEXTS = [
     (name, key)
-    for name, (_, cls) in COMMANDS.items()
+    for name, cls in OTHERS.items()
     for key, item in section.keys(cls).items()
     if str in values.options(item.type)
 ]
 NUMBERS = [
     (name, key)
-    for name, (_, cls) in COMMANDS.items()
+    for name, cls in OTHERS.items()
     for key, item in section.keys(cls).items()
     if {int, float} & {*values.options(item.type)}
 ]

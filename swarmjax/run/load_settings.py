@@ -78,6 +78,13 @@ def load_train(
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
     """
+    return load_as(TrainConfig, overrides, stages)
+
+
+def load_as[C: TrainConfig](
+    cls: type[C], overrides: Sequence[str], stages: Sequence[dict[str, Any]] | None = None
+) -> C:
+    """Does what `load_train` does, for a command that has all keys of `swarmjax.train`."""
 
     def complete(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
         if stages is None:
@@ -91,8 +98,8 @@ def load_train(
             mapping = mapping | {"curriculum": {"mode": "frontier"} | options}
         return mapping | {"stage": found}
 
-    given = recipes.expand(TrainConfig, overrides)
-    return settle(files.load(TrainConfig, [*_inherited(given), *given], complete))
+    given = recipes.expand(cls, overrides)
+    return settle(files.load(cls, [*_inherited(cls, given), *given], complete))
 
 
 def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
@@ -110,12 +117,12 @@ def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
     return axes.expand(stages[0], along)
 
 
-def _inherited(typed: Sequence[str]) -> list[str]:
+def _inherited(cls: type[TrainConfig], typed: Sequence[str]) -> list[str]:
     """Returns the words that a run with `init_from` takes from the run that it starts from.
 
     They set robot, task, realism and the shape of the networks. Typed words override them.
     """
-    source = files.parse(TrainConfig, typed).get("init_from")
+    source = files.parse(cls, typed).get("init_from")
     if not isinstance(source, str):
         return []
     try:
@@ -128,14 +135,14 @@ def _inherited(typed: Sequence[str]) -> list[str]:
     ):
         others.append("memory_size")  # this key belongs to the kind of memory that was typed
     return [
-        *inherit.group_words(TrainConfig, "robot", held.robot, typed),
-        *inherit.group_words(TrainConfig, "task", held.task, typed),
-        *inherit.group_words(TrainConfig, "algo", held.algo, typed, skip=others),
-        *inherit.preset_words(TrainConfig, "realism", held.realism, typed),
+        *inherit.group_words(cls, "robot", held.robot, typed),
+        *inherit.group_words(cls, "task", held.task, typed),
+        *inherit.group_words(cls, "algo", held.algo, typed, skip=others),
+        *inherit.preset_words(cls, "realism", held.realism, typed),
     ]
 
 
-def settle(settings: TrainConfig) -> TrainConfig:
+def settle[C: TrainConfig](settings: C) -> C:
     """Adds the full names and digests of the extension pieces that a run uses.
 
     Args:

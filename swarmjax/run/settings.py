@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-from swarmjax.config import ConfigError, Section, setting
+from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
 from swarmjax.task.config import check_realism
 from swarmjax.task.stage_config import make_room
@@ -145,3 +145,21 @@ class TrainConfig(ProgramConfig):
                 f"budget is {self.budget}, but one update takes arenas x algo.rollout_length = "
                 f"{update} control steps: give at least {update}."
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeConfig(TrainConfig):
+    """All settings of a probe: those of a training run, and how many episodes are counted."""
+
+    episodes: int = setting(
+        256, "episodes of each stage, rounded up to a multiple of arenas", 1, MAX_COUNT
+    )
+
+    def _check(self) -> None:
+        super()._check()
+        for key in ("resume", "init_from"):
+            if getattr(self, key) is not None:
+                raise ConfigError(
+                    f"{key} is {show(getattr(self, key))}, but a probe drives an untrained swarm: "
+                    f"leave {key} out."
+                )

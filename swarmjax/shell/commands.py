@@ -21,6 +21,9 @@ class Command(NamedTuple):
 # One line per command.
 COMMANDS: dict[str, Command] = {
     "train": Command("swarmjax.run.settings:TrainConfig", "Train a swarm."),
+    "probe": Command(
+        "swarmjax.run.settings:ProbeConfig", "Count what an untrained swarm reaches by chance."
+    ),
     "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Judge policies in MuJoCo C."),
     "replay": Command("swarmjax.replay.config:ReplayConfig", "Show episodes on a page."),
     "report": Command("swarmjax.report.config:ReportConfig", "Draw the results of runs."),

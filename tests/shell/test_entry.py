@@ -56,8 +56,8 @@ def test_version_names_swarmjax_jax_and_mujoco(
     [
         (["trian"], "'trian' is not a command: did you mean train?"),
         (
-            ["frob"],
-            f"'frob' is not a command: give one of {', '.join(COMMANDS)}.",
+            ["xyz"],
+            f"'xyz' is not a command: give one of {', '.join(COMMANDS)}.",
         ),
     ],
 )
