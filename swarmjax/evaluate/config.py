@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT
@@ -11,9 +11,9 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.stage_config import StageConfig
 
-# Friction of the judged robots' hulls on hulls, boxes and walls: `coulombFriction` of Webots'
-# ContactProperties is 1 by default.
-HULL_FRICTION = 1.0
+# What a judge's robot has unless a robot file or a word says otherwise. Hulls rub on hulls, boxes
+# and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
+JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
 STEPS = 1500  # control steps of an episode by default; Table 1
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
@@ -33,7 +33,7 @@ class JudgeConfig(Section):
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
     stage: StageConfig
-    robot: RobotConfig = field(default_factory=lambda: RobotConfig(body="wheeled"))
+    robot: RobotConfig = field(default_factory=lambda: RobotConfig(**JUDGED))
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = setting(
         None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from swarmjax import policy_file
 from swarmjax.config import ConfigError, Section, build, files, inherit
 from swarmjax.config.section import build_stored
-from swarmjax.evaluate.config import HULL_FRICTION
+from swarmjax.evaluate.config import JUDGED
 from swarmjax.evaluate.evaluation import list_files
 from swarmjax.evaluate.trials import Entrant
 from swarmjax.sim.config import RobotConfig
@@ -22,8 +22,6 @@ from swarmjax.task.config import TaskConfig, describe
 
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
-# What a judge's robot has unless the command line or a robot file says otherwise.
-_JUDGED = {"body": "wheeled", "hull_friction": HULL_FRICTION}
 _SHOWN = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 
 
@@ -117,10 +115,10 @@ def _words(cls: type[Section], training: Trained, typed: Sequence[str]) -> list[
     """Converts the training's settings to arguments."""
     choice = files.parse(cls, typed).get("robot")
     own = {} if choice is None else files.read_choice("robot", choice)
-    judged = _JUDGED.keys() - own.get("robot", own).keys()
+    judged = JUDGED.keys() - own.get("robot", own).keys()
     return [
-        *(f"robot.{key}={_JUDGED[key]}" for key in sorted(judged)),
-        *inherit.group_words(cls, "robot", training.robot, typed, skip=_JUDGED),
+        *(f"robot.{key}={JUDGED[key]}" for key in sorted(judged)),
+        *inherit.group_words(cls, "robot", training.robot, typed, skip=JUDGED),
         *inherit.group_words(cls, "task", training.task, typed),
         *inherit.preset_words(cls, "realism", training.realism, typed),
     ]
