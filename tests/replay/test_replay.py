@@ -188,7 +188,7 @@ def test_what_a_suite_has_not_is_refused(steer, suite):
 def test_defaults():
     settings = load_levels(ReplayConfig, ["policy=a.npz,b.npz"])
     stage = load_levels(EvaluateConfig, ["policy=a"]).stage
-    assert settings == ReplayConfig(policy="a.npz,b.npz", stage=stage)
+    assert settings == ReplayConfig(policy="a.npz,b.npz", stage=stage, robot=settings.robot)
     assert settings.policies == ("a.npz", "b.npz")
     assert (settings.levels, settings.robot.body) == ((0,), "wheeled")
     assert settings.evaluation.step_limit == 1500

@@ -84,7 +84,9 @@ def test_independent_policies_have_one_learner_a_robot():
 
 def test_evaluate_defaults():
     evaluate = load_levels(EvaluateConfig, ["policy=p.npz"])
-    assert evaluate == EvaluateConfig(policy="p.npz", stage=load_train(["stage=s6"]).stage[0])
+    stage = load_train(["stage=s6"]).stage[0]
+    assert evaluate == EvaluateConfig(policy="p.npz", stage=stage, robot=evaluate.robot)
+    assert evaluate.robot.body == "wheeled"
     assert (evaluate.step_limit, evaluate.episodes, evaluate.seed) == (1500, 1000, 1)
 
 
