@@ -32,7 +32,7 @@ TAKEN = {
     "observation": ("infrared", "target_distance", "target_bearing"),
     "level": (
         *("random", "fixed", "map"),
-        *("trap", "fence", "bay", "row", "door", "maze", "circle", "crowd"),
+        *("trap", "fence", "bay", "row", "door", "maze", "blocks", "circle", "crowd"),
     ),
     "network": ("mlp",),
     "curriculum": ("sequential", "mixed", "adaptive", "frontier"),

@@ -112,7 +112,7 @@ class StageConfig(Section):
     apart: _Length = setting(
         None, "distance between targets, or from targets to a door, m, or a range", 0.05, 1
     )
-    cells: int | None = setting(None, "cells along a maze's side", 2, 8)
+    cells: int | None = setting(None, "cells along a side of a maze or of blocks", 2, 8)
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):

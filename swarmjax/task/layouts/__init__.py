@@ -5,7 +5,7 @@ layouts share. `drawing.py` turns a layout into a level. Lengths are whole units
 NumPy and JAX draw the same bits. The package may import `placement.py` and `sim.noise`.
 """
 
-from swarmjax.task.layouts import barriers, maze, open_floor
+from swarmjax.task.layouts import barriers, blocks, maze, open_floor
 from swarmjax.task.layouts.site import ArenaLayout
 
 LAYOUTS: dict[str, ArenaLayout] = {
@@ -15,6 +15,7 @@ LAYOUTS: dict[str, ArenaLayout] = {
     "row": barriers.ROW,
     "door": barriers.DOOR,
     "maze": maze.MAZE,
+    "blocks": blocks.BLOCKS,
     "circle": open_floor.CIRCLE,
     "crowd": open_floor.CROWD,
 }

@@ -50,18 +50,37 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
     pairs = edges(cells)
     order, rooms, aside = split(uniforms, [len(pairs), cells * cells, 4 * count])
     open_ = _braid(pairs, _tree(pairs, order, xp), order, cells, xp)
-    edge = 2 * site.half[0] // cells
-    corner = -site.half[0]
-    chosen = xp.argsort(rooms, stable=True)[: 2 * count].astype(xp.int32)
-    if cells * cells < 2 * count:  # a program may have more robots than fit into a maze
+    edge, corner = 2 * site.half[0] // cells, -site.half[0]
+    ranked = xp.argsort(rooms, stable=True)
+    start, target = in_cells(ranked, aside, site, THICKNESS // 2, xp)
+    return Drawn(_walls(pairs, cells, edge, corner, xp), ~open_, start, target)
+
+
+def in_cells(ranked: Array, aside: Array, site: Site, wall: int, xp: Any) -> tuple[Array, Array]:
+    """Places starts and targets in cells of their own, at random within the cells.
+
+    Args:
+      ranked: [C] cells, those to use first.
+      aside: [4 R] uniform numbers in [0, 1).
+      site: the arena.
+      wall: how far walls reach into a cell, units.
+      xp: `numpy` or `jax.numpy`.
+
+    Returns:
+      Starts and targets [R, 2], units.
+    """
+    count, cells = site.present.shape[0], site.cells
+    chosen = ranked[: 2 * count].astype(xp.int32)
+    if cells * cells < 2 * count:  # a program may have more robots than fit into the cells
         lacking = xp.zeros(2 * count - cells * cells, xp.int32)
         chosen = xp.concatenate([chosen, lacking])
-    centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge + corner + edge // 2
-    most = xp.maximum(edge // 2 - THICKNESS // 2 - site.clear, 0)
+    edge = 2 * site.half[0] // cells
+    centre = xp.stack([chosen % cells, chosen // cells], axis=-1) * edge - site.half[0] + edge // 2
+    most = xp.maximum(edge // 2 - wall - site.clear, 0)
     place = centre + pick(aside.reshape(2 * count, 2), -most, most, xp)
     # Starts and targets alternate, so that a robot's cells do not depend on the compiled number of
     # robots.
-    return Drawn(_walls(pairs, cells, edge, corner, xp), ~open_, place[0::2], place[1::2])
+    return place[0::2], place[1::2]
 
 
 def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
