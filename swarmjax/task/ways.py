@@ -1,14 +1,14 @@
 """Places starts at a given way from their targets, along the shortest path round walls.
 
-Every lattice point has a shortest way to the target, through corners of a visibility graph
-(Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
+Many points all over the arena have a shortest way to the target, through corners of a visibility
+graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
 Obstacles"). A point with a longer way than wanted moves along its first straight leg, until the
 rest is as long as wanted. All lengths are integers, so NumPy and JAX choose the same starts.
 
 Walls are widened as in `geodesic.py`. Ways turn at the corners of walls only. Among turned boxes,
 a start therefore sees its target past the squares around the boxes, and its way is straight.
 
-Axes: R robots, M obstacles, K = 4 M corners, P lattice points. Lengths are units of 1/4096 m.
+Axes: R robots, M obstacles, K = 4 M corners, P points. Lengths are units of 1/4096 m.
 """
 
 from typing import Any, NamedTuple
@@ -25,8 +25,8 @@ from swarmjax.task.placement import (
     clearance,
     fold,
     gaps_of,
-    lattice,
     repeat,
+    round_up,
     score_rectangles,
     score_things,
     score_walls,
@@ -44,14 +44,20 @@ _NO_WAY = 2**29  # length of a way that does not exist; an int32 holds the sum o
 _COARSE = 2
 _SQUARE = np.float32(1.41422)  # half edge of the square around a turned square of half edge 1
 _OTHER = 2**27  # subtracted from the score of a start with another way; soft scores are less
+_POINTS = 576
+_TIGHT = 4e-3  # m; least free space beside walls, where there is not room for more
+# Multiples of these shares of 2**32 fill a square evenly, and no two points have the same x or y,
+# so that some lie in every narrow corridor (Roberts 2018, "The Unreasonable Effectiveness of
+# Quasirandom Sequences": 1 / g and 1 / g**2 with g**3 = g + 1).
+_STEPS = np.array([3242174889, 2447445414], np.uint32)
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], np.int32)
 
 
 class Plan(NamedTuple):
-    """The lattice of a level, and the straight legs between its points, corners and targets.
+    """The straight legs of a level between points, corners and targets.
 
     Attributes:
-      points: [P, 2] lattice points.
+      points: [P, 2] points all over the arena.
       corner: [K, 2] corners of the widened walls.
       target: [R, 2].
       to_corner: [P, K] lengths of legs from points to corners; here and below, `_NO_WAY` if barred.
@@ -87,8 +93,13 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
     number = xp.arange(len(level.target))
     drawn = noise.uniform(level.seed, 0, Stream.WAY, (3 + len(number),), xp)
     way = pick(drawn[0], distance[0], distance[1], xp)
-    plan = _plan(level, lattice(drawn[1:3], side, xp), rectangle, hull, xp)
-    gaps, clear = gaps_of(hull, reach), clearance(hull)
+    plan = _plan(level, _points(drawn[1:3], side, xp), rectangle, hull, xp)
+    gaps = gaps_of(hull, reach)
+
+    def beside_walls(candidates: Array, clear: int) -> Array:
+        within = score_walls(candidates, side, clear, xp)
+        beside = score_rectangles(candidates, rectangle, level.obstacle_present, clear, xp)
+        return xp.minimum(within, beside)
 
     def step(placed: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         robot, there = row
@@ -96,8 +107,8 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
         others = level.present & (number != robot)
         score = [
             xp.where(exists, 0, FORBIDDEN),
-            score_walls(candidates, side, clear, xp),
-            score_rectangles(candidates, rectangle, level.obstacle_present, clear, xp),
+            beside_walls(candidates, round_up(hull + _TIGHT)),
+            xp.maximum(beside_walls(candidates, clearance(hull)), -1),
             score_things(candidates, plan.target, others, gaps.from_target, xp),
             score_things(candidates, placed[:, :2], placed[:, 2] > 0, gaps.start, xp),
         ]
@@ -110,6 +121,13 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
 
     nobody = xp.zeros((len(number), 3), xp.int32)
     return fold(step, nobody, (number, level.present), xp, unroll=1)
+
+
+def _points(shift: Array, side: Array, xp: Any) -> Array:
+    """Spreads points [P, 2] over a square, shifted by two uniform numbers; units."""
+    first = (shift * np.float32(2**24)).astype(xp.uint32) << 8
+    share = first + np.arange(_POINTS, dtype=np.uint32)[:, None] * _STEPS
+    return ((share >> 17).astype(xp.int32) * side >> 15) - side // 2
 
 
 def _candidates(

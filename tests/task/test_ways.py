@@ -1,6 +1,5 @@
 """Checks starts at a given way from their targets, by hand and with geometry of the tests' own."""
 
-import itertools
 import math
 
 import chex
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from swarmjax.config import ConfigError, build
 from swarmjax.sim import gaps
-from swarmjax.task import geodesic, level, room, ways
+from swarmjax.task import geodesic, level, room, stage_files, ways
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.placement import UNITS
@@ -161,31 +160,33 @@ LAYOUTS = {
     "world_row": 0.3,
     "world_door": 0.3,
     "world_maze": 0.5,
+    "world_blocks": 0.3,
     "world_circle10": 0.3,
     "world_crowd10": 0.15,
     "world_dense": 0.3,
+    "map": 0.9,
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_ten_thousand_levels_of_each_layout(name: str) -> None:
-    from swarmjax.task import stage_files
-
-    plain = stage_files.read_stage(name) | {"distance": LAYOUTS[name]}
-    stage = build(StageConfig, plain)
+    plain = STAGES[4] if name == "map" else stage_files.read_stage(name)
+    stage = build(StageConfig, complete(plain | {"distance": LAYOUTS[name]}))
     spacing = Spacing(stage.robots, stage.obstacles, HULL, REACH)
-    arrays = task_stage.single(stage)
+    arrays, ends = task_stage.single(stage), np.array(stage.distance_units)
 
-    @jax.jit
-    def lengths(uniforms: jax.Array) -> tuple[jax.Array, jax.Array]:
-        drawn = jax.vmap(lambda each: level.sample(each, arrays, spacing, jnp))(uniforms)
-        return jax.vmap(lambda each: geodesic.begin(each, HULL).distance)(drawn), drawn.present
+    def measured(uniforms: jax.Array) -> tuple[jax.Array, ...]:
+        drawn = level.sample(uniforms, arrays, spacing, jnp)
+        _, has_way = ways.starts(drawn, ends, HULL, REACH, jnp)
+        gap = jnp.min(gaps.gaps(drawn.start, drawn.side, drawn.obstacle, HULL, jnp), axis=-1)
+        return geodesic.begin(drawn, HULL).distance, gap, has_way, drawn.present
 
+    measure = jax.jit(jax.vmap(measured))
     random = np.random.default_rng(6)
-    shares = []
-    for _ in itertools.repeat(None, 10):
+    for _ in range(10):
         uniforms = random.random((1000, level.uniform_count(spacing)), np.float32)
-        length, present = (np.asarray(each) for each in lengths(uniforms))
-        shares.append((np.abs(length / stage.distance - 1) < 0.01)[present].mean())
-    assert np.mean(shares) > 0.99  # the others have no room at this way
+        length, gap, has_way, present = (np.asarray(each) for each in measure(uniforms))
+        assert (gap[present] > 0.0).all()
+        assert (np.abs(length / stage.distance - 1)[present & has_way] < 0.01).all()
+        assert has_way[present].mean() > 0.9  # the others have no room at this way
