@@ -34,8 +34,6 @@ from swarmjax.task import extended
 # Share of the arenas on earlier stages with `mixed`, on learned ones with `frontier`: this
 # project's choice.
 _EARLIER = 0.2
-# Shares of the other arenas with `frontier`: on the open stages, and one and two steps further.
-_AHEAD = (0.7, 0.2, 0.1)
 _UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
@@ -225,8 +223,7 @@ def frontier(
     stages one step easier are learned. So success widens the frontier, failure narrows it, and no
     budget moves it. The last stage stays in training once it is open. Widening each axis by its own
     success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube with a
-    Robot Hand", arXiv:1910.07113, section 5). A verdict takes two step limits, so some arenas
-    already try what the frontier would open next. If these succeed, it moves on by several steps.
+    Robot Hand", arXiv:1910.07113, section 5).
 
     Args:
       state: as in `promoting`.
@@ -241,19 +238,14 @@ def frontier(
     stages = state.chosen.weights.shape[0]
     index, easier = jnp.arange(stages), jnp.asarray(schedule.easier)
     learned = (verdict.record.fast >= schedule.threshold) & (index < stages - 1)
-    passed, layers = learned, []
-    for _ in _AHEAD:
-        layers.append(~jnp.any(easier & ~passed, axis=-1) & ~passed)
-        passed |= layers[-1]
-    shares = [share * _evenly(layer) for share, layer in zip(_AHEAD, layers, strict=True)]
-    ahead = sum(shares[1:], shares[0])
+    front = ~jnp.any(easier & ~learned, axis=-1) & ~learned
     kept = jnp.where(jnp.any(learned), _EARLIER, 0.0)
-    weights = (1.0 - kept) * ahead / jnp.sum(ahead) + kept * _evenly(learned)
+    weights = (1.0 - kept) * _evenly(front) + kept * _evenly(learned)
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * weights
     changed = verdict.over & jnp.any(weights != state.chosen.weights)
     return StageChoice(
-        stage=jnp.max(jnp.where(layers[0], index, 0)).astype(jnp.int32),
+        stage=jnp.max(jnp.where(front, index, 0)).astype(jnp.int32),
         weights=jnp.where(verdict.over, weights, state.chosen.weights),
         reason=jnp.where(changed & (update >= 0), REWEIGHED, STAYED).astype(jnp.int32),
     )

@@ -219,31 +219,29 @@ def _front(fast: list[float], weights: list[float], **more: Any) -> StageChoice:
 
 
 @pytest.mark.parametrize(
-    ("fast", "layers", "learned"),
+    ("fast", "front", "learned"),
     [
-        ([NAN] * 6, [[0], [1, 3], [2, 4]], []),
-        ([0.7, NAN, NAN, NAN, NAN, NAN], [[0], [1, 3], [2, 4]], []),
-        ([0.8, NAN, NAN, NAN, NAN, NAN], [[1, 3], [2, 4], [5]], [0]),
+        ([NAN] * 6, [0], []),
+        ([0.7, NAN, NAN, NAN, NAN, NAN], [0], []),
+        ([0.8, NAN, NAN, NAN, NAN, NAN], [1, 3], [0]),
         # Stage 4 opens once both of its easier neighbours are learned.
-        ([0.9, 0.9, 0.1, 0.2, 0.0, 0.0], [[2, 3], [4], [5]], [0, 1]),
-        ([0.9, 0.9, 0.1, 0.9, 0.0, 0.0], [[2, 4], [5], []], [0, 1, 3]),
+        ([0.9, 0.9, 0.1, 0.2, 0.0, 0.0], [2, 3], [0, 1]),
+        ([0.9, 0.9, 0.1, 0.9, 0.0, 0.0], [2, 4], [0, 1, 3]),
         # Failure narrows: stage 0 is practised again, and what stage 1 opened is closed.
-        ([0.5, 0.9, 0.1, 0.1, 0.1, 0.1], [[0, 2], [3], [4]], [1]),
-        ([0.9] * 5 + [0.3], [[5], [], []], [0, 1, 2, 3, 4]),
+        ([0.5, 0.9, 0.1, 0.1, 0.1, 0.1], [0, 2], [1]),
+        ([0.9] * 5 + [0.3], [5], [0, 1, 2, 3, 4]),
         # The last stage stays in training.
-        ([0.9] * 6, [[5], [], []], [0, 1, 2, 3, 4]),
+        ([0.9] * 6, [5], [0, 1, 2, 3, 4]),
         # A stage beyond the frontier may be learned before it opens.
-        ([0.5, NAN, NAN, NAN, 0.9, 0.0], [[0], [1, 3], [2]], [4]),
+        ([0.5, NAN, NAN, NAN, 0.9, 0.0], [0], [4]),
     ],
 )
 def test_the_frontier_is_open_and_not_learned(
-    fast: list[float], layers: list[list[int]], learned: list[int]
+    fast: list[float], front: list[int], learned: list[int]
 ) -> None:
     found = _front(fast, [0.0] * 6)
-    ahead = np.zeros(6)
-    for share, layer in zip((0.7, 0.2, 0.1), layers, strict=True):
-        ahead[layer] += share / max(len(layer), 1)
-    expected = 0.1 / 6 + 0.9 * (0.8 if learned else 1.0) * ahead / ahead.sum()
+    expected = np.full(6, 0.1 / 6)
+    expected[front] += 0.9 * (0.8 if learned else 1.0) / len(front)
     expected[learned] += 0.9 * 0.2 / max(len(learned), 1)
     np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
     assert int(found.reason) == REWEIGHED
@@ -260,7 +258,7 @@ def test_the_frontier_decides_nothing_within_a_cohort_or_without_a_change() -> N
 def test_a_sequence_of_stages_opens_one_by_one() -> None:
     verdict = _verdict([0.5] * 3, fast=[0.9, 0.1, NAN])
     found = _choose(FRONTIER, _state(0, 3), _schedule(3), verdict, 3)
-    expected = 0.1 / 3 + 0.9 * np.array([0.2, 0.8 * 7 / 9, 0.8 * 2 / 9])
+    expected = 0.1 / 3 + 0.9 * np.array([0.2, 0.8, 0.0])
     np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
     assert int(found.stage) == 1
 
@@ -387,20 +385,14 @@ class Reference:
         return weights
 
     def _frontier(self) -> np.ndarray:
-        """Weighs a sequence: its first stage that is not learned, and the two after that."""
+        """Weighs a sequence: stages that follow a learned one, or the first, and learned ones."""
         learned = [i for i in range(self.stages - 1) if self.fast[i] >= self.numbers.threshold]
         others = [i for i in range(self.stages) if i not in learned]
-        # A stage after a learned one is open, even if an earlier one was lost.
-        layers, passed = [], list(learned)
-        for _ in range(3):
-            layers.append([i for i in others if i not in passed and (not i or i - 1 in passed)])
-            passed += layers[-1]
-        self.stage = max(layers[0])
-        ahead = np.zeros(self.stages)
-        for share, layer in zip((0.7, 0.2, 0.1), layers, strict=True):
-            ahead[layer] += share / max(len(layer), 1)
-        weights = (0.8 if learned else 1.0) * ahead / ahead.sum()
-        weights[learned] += 0.2 / max(len(learned), 1)
+        front = [i for i in others if i == 0 or i - 1 in learned]
+        self.stage = max(front)
+        weights = np.zeros(self.stages)
+        weights[front] = (0.8 if learned else 1.0) / len(front)
+        weights[learned] = 0.2 / max(len(learned), 1)
         return 0.1 / self.stages + 0.9 * weights
 
 
