@@ -39,9 +39,6 @@ Array = Any
 # set off by the second.
 _WIDENED, _CORNER = 0.8, 0.9
 _NO_WAY = 2**29  # length of a way that does not exist; an int32 holds the sum of two
-# Lines of sight are tested in units of 1/1024 m, so that an int32 holds products of lengths. The
-# error of 1 mm is a quarter of the distance between a corner and its widened wall.
-_COARSE = 2
 _SQUARE = np.float32(1.41422)  # half edge of the square around a turned square of half edge 1
 _OTHER = 2**27  # subtracted from the score of a start with another way; soft scores are less
 _POINTS = 576
@@ -216,10 +213,10 @@ def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int
 
     The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
-    a, b = begin[:, None] >> _COARSE, end[None] >> _COARSE
-    middle, across = a + b, b - a  # twice the middle of the leg; the leg
-    half = (rectangle[:, 2:] + widened) >> (_COARSE - 1)  # twice the half edges
-    centre = rectangle[:, :2] >> (_COARSE - 1)
+    # Twice the middle of the leg, and the leg. In an arena of 4 m they are at most 2**15 and 2**14
+    # from a wall's centre, so an int32 holds the sum of two products.
+    middle, across = begin[:, None] + end[None], end[None] - begin[:, None]
+    centre, half = 2 * rectangle[:, :2], 2 * (rectangle[:, 2:] + widened)
 
     def is_barred(i: Array, barred: Array) -> Array:
         x, y = middle[..., 0] - centre[i, 0], middle[..., 1] - centre[i, 1]
@@ -230,9 +227,8 @@ def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int
         return barred | (meets & there[i])
 
     barred = repeat(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
-    away = end[None] - begin[:, None]
     # Squares of distances to parking places may overflow; nobody goes there.
-    square = xp.maximum(xp.sum(away * away, axis=-1, dtype=xp.int32), 0)
+    square = xp.maximum(xp.sum(across * across, axis=-1, dtype=xp.int32), 0)
     return xp.where(barred, _NO_WAY, _root(square, xp))
 
 
