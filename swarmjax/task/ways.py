@@ -116,8 +116,8 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
         placed = xp.where(mine[:, None], start, placed)
         return placed, (candidates[best], score[best] > -_OTHER)
 
-    nobody = xp.zeros((len(number), 3), xp.int32)
-    return fold(step, nobody, (number, level.present), xp, unroll=1)
+    none_placed = xp.zeros((len(number), 3), xp.int32)
+    return fold(step, none_placed, (number, level.present), xp, unroll=1)
 
 
 def _points(shift: Array, side: Array, xp: Any) -> Array:
@@ -227,7 +227,7 @@ def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int
         return barred | (meets & there[i])
 
     barred = repeat(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
-    # Squares of distances to parking places may overflow; nobody goes there.
+    # Squares of distances to parking places may overflow; no way leads there.
     square = xp.maximum(xp.sum(across * across, axis=-1, dtype=xp.int32), 0)
     return xp.where(barred, _NO_WAY, _root(square, xp))
 
