@@ -60,6 +60,16 @@ def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
             f"curriculum.axes.{key} is {show(values)}: give a list of values from easy to hard, "
             "without the stage's own."
         )
+    for value in values:
+        ends = value if isinstance(value, Sequence) and len(value) == 2 else [value]
+        if any(isinstance(end, bool) or not isinstance(end, int | float) for end in ends):
+            raise ConfigError(
+                f"curriculum.axes.{key} holds {show(value)}: give numbers, or ranges [low,high]."
+            )
+        if values.count(value) > 1:
+            raise ConfigError(
+                f"curriculum.axes.{key} holds {show(value)} more than once: give it once."
+            )
     if stage.get(key) in values:
         raise ConfigError(
             f"curriculum.axes.{key} is {show(values)}, but stage.{key} is "

@@ -181,7 +181,7 @@ def score_rectangles(points: Array, rectangle: Array, there: Array, gap: int, xp
     apart = xp.maximum(apart, 0)
     square = xp.sum(apart * apart, axis=-1)
     score = xp.where(square < gap * gap, FORBIDDEN + square, 0)
-    return xp.min(xp.where(there, score, 0), axis=-1)
+    return xp.min(xp.where(there, score, 0), axis=-1, initial=0)
 
 
 def place(
@@ -233,7 +233,7 @@ def fold(
 
 def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S:
     """Calls `step(i, state)` for each i below `count`; XLA takes long to compile it unrolled."""
-    if xp is not np:
+    if xp is not np and count:  # JAX traces the step even if it is called for nothing
         from jax import lax  # evaluations draw levels without JAX
 
         return lax.fori_loop(0, count, step, state)

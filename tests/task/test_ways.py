@@ -148,6 +148,16 @@ def test_a_distance_that_no_level_has_is_refused(distance: float, message: str) 
         room.check([stage], SPACING)
 
 
+def test_an_arena_without_any_obstacle_has_ways() -> None:
+    stage = task_stage.single(StageConfig(name="x", robots=2, side=0.7, distance=0.2))
+    spacing = Spacing(2, 0, HULL, REACH)
+    uniforms = UNIFORMS[0, : level.uniform_count(spacing)]
+    for xp in (np, jnp):
+        drawn = level.sample(uniforms, stage, spacing, xp)
+        away = np.linalg.norm(np.asarray(drawn.start[:, :2] - drawn.target), axis=-1)
+        np.testing.assert_allclose(away, 0.2, rtol=0.01)  # rounding, as above
+
+
 def test_a_fixed_level_takes_no_distance() -> None:
     with pytest.raises(ConfigError, match="level is fixed, whose starts are given: leave distance"):
         StageConfig(name="x", robots=2, side=1.2, level="fixed", distance=0.3)
