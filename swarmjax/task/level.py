@@ -291,10 +291,14 @@ def _laid_out(
 
 
 def _at_distance(level: Level, distance: Array, spacing: Spacing, xp: Any) -> Level:
-    """Moves the starts to places with a given way to their targets, if the stage gives one."""
-    place, _ = ways.starts(level, distance, spacing.hull_radius, spacing.target_radius, xp)
+    """Moves the starts to places with a given way to their targets, if the stage gives one.
+
+    A level without room for all robots keeps its own starts.
+    """
+    sizes = spacing.hull_radius, spacing.target_radius
+    place, _, has_room = ways.starts(level, distance, *sizes, xp)
     start = xp.concatenate([metres(place, xp), level.start[:, 2:]], axis=-1)
-    return level._replace(start=xp.where(distance[1] > 0, start, level.start))
+    return level._replace(start=xp.where((distance[1] > 0) & has_room, start, level.start))
 
 
 def _rows(array: Array, count: int, xp: Any) -> Array:

@@ -1,6 +1,7 @@
 """Checks that maps, layouts and an extension's level drawings place robots where they fit."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,24 +33,27 @@ def check(
     Raises:
       ConfigError: a stage or a drawing has a fault; the message says which.
     """
-    uniforms = np.random.default_rng(0).random(
-        (_TRIED, level.uniform_count(spacing)), dtype=np.float32
-    )
     for stage in stages:
         own = next((piece for piece in drawings if piece.name == stage.level), None)
-        if own is None and not stage.map and stage.kind is None and stage.distance is None:
-            continue
-        arrays = task_stage.single(stage, drawings)
-        for each in uniforms:
-            drawn = level.sample(each, arrays, spacing, np)
-            if own is None:
-                check_level(stage, drawn, spacing)
-            else:
+        if own is not None:
+            for drawn in _levels(stage, spacing, drawings):
                 _check_own(own, stage, drawn, spacing)
+        elif stage.map or stage.kind is not None:
+            # A level in which no starts have the way and room keeps those that are checked here.
+            for drawn in _levels(replace(stage, distance=None), spacing):
+                check_level(stage, drawn, spacing)
         if stage.distance is not None:
-            _check_distance(
-                stage, [level.sample(each, arrays, spacing, np) for each in uniforms], spacing
-            )
+            _check_distance(stage, spacing, drawings)
+
+
+def _levels(
+    stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing] = ()
+) -> Iterator[Level]:
+    """Draws the levels to check, one by one."""
+    count = level.uniform_count(spacing)
+    arrays = task_stage.single(stage, drawings)
+    for uniforms in np.random.default_rng(0).random((_TRIED, count), dtype=np.float32):
+        yield level.sample(uniforms, arrays, spacing, np)
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
@@ -74,7 +78,7 @@ def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spa
         raise ConfigError(f"{extended.label(own)}, drawn for stage {stage.name}: {problem}.")
 
 
-def _check_distance(stage: StageConfig, levels: Sequence[Level], spacing: Spacing) -> None:
+def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> None:
     """Refuses a distance at which a robot has arrived, or that no level has."""
     least = round(spacing.target_radius + MARGIN, 4)
     ends = np.array(stage.distance_units)
@@ -84,7 +88,10 @@ def _check_distance(stage: StageConfig, levels: Sequence[Level], spacing: Spacin
             f"{spacing.target_radius:g} m of its target: give at least {least:g}."
         )
     sizes = spacing.hull_radius, spacing.target_radius
-    if not any((ways.starts(each, ends, *sizes, np)[1] & each.present).any() for each in levels):
+    # Absent robots would take as long as the others.
+    own = spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
+    levels = _levels(replace(stage, distance=None), own, drawings)
+    if not any(ways.starts(each, ends, *sizes, np)[1].any() for each in levels):
         raise ConfigError(
             f"stage {stage.name}: distance is {show(stage.distance)}, but in {_TRIED} levels no "
             "robot has a way of this length to its target: give less."

@@ -70,11 +70,13 @@ class Plan(NamedTuple):
     to_go: Array
 
 
-def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> tuple[Array, Array]:
+def starts(
+    level: Any, distance: Array, hull: float, reach: float, xp: Any
+) -> tuple[Array, Array, Array]:
     """Chooses starts from which the ways to the targets have a given length.
 
     Starts keep the distances of `gaps_of` from each other and from the targets of other robots. A
-    robot that finds no such start gets one with another way.
+    robot that finds no such start gets one with another way, or one without room if there is none.
 
     Args:
       level: the level as drawn, a `level.Level`.
@@ -84,7 +86,8 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
       xp: `numpy` or `jax.numpy`; both choose the same starts.
 
     Returns:
-      [R, 2] x and y of the starts, units, and [R] whether their ways have the drawn length.
+      [R, 2] x and y of the starts, units; [R] whether their ways have the drawn length; and []
+      whether all of them keep the least distances to everything else.
     """
     side, rectangle = units(level.side, xp), _rectangles(level, xp)
     number = xp.arange(len(level.target))
@@ -114,10 +117,13 @@ def starts(level: Any, distance: Array, hull: float, reach: float, xp: Any) -> t
         mine = (number == robot) & there
         start = xp.concatenate([candidates[best], xp.ones(1, xp.int32)])
         placed = xp.where(mine[:, None], start, placed)
-        return placed, (candidates[best], score[best] > -_OTHER)
+        reached = xp.stack([score[best] > -_OTHER, score[best] > FORBIDDEN // 2])
+        return placed, (candidates[best], reached)
 
     none_placed = xp.zeros((len(number), 3), xp.int32)
-    return fold(step, none_placed, (number, level.present), xp, unroll=1)
+    place, reached = fold(step, none_placed, (number, level.present), xp, unroll=1)
+    has_way, has_room = reached[:, 0], reached[:, 1]
+    return place, has_way, xp.all(has_room | ~level.present)
 
 
 def _points(shift: Array, side: Array, xp: Any) -> Array:
