@@ -7,15 +7,22 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, PercentFormatter
+from PIL import Image
 
 WIDTH = 8.6  # inches
 _DOTS = 110  # per inch
+_COLOURS = 128
 
 
 def png(figure: Figure) -> bytes:
-    """Makes a PNG file of a figure: the same file in any Matplotlib version."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=_DOTS, metadata={"Software": None})
+    """Makes a PNG file of a figure: the same file in any Matplotlib version.
+
+    A palette makes it a quarter as large, which counts in a report with a curve for each of fifty
+    seeds.
+    """
+    drawn, content = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=_DOTS)
+    Image.open(drawn).convert("RGB").quantize(_COLOURS).save(content, "png", optimize=True)
     return content.getvalue()
 
 

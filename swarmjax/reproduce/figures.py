@@ -120,13 +120,14 @@ def _style(arm: str) -> dict[str, Any]:
 def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) -> None:
     """Draws the rolling means of an arm."""
     seeds, colour = [], COLOURS[arm]
+    faint = min(0.35, 5.0 / len(data.seeds))  # many seeds would hide the bands
     for log in data.logs[arm]:
         chosen = log.on(panel.stage)
         at = measures.along(chosen, axis)[WINDOW - 1 :]
         means = measures.rolling(np.asarray(panel.of(chosen), float))
         seeds.append((at, means))
         every = max(1, len(at) // 500)  # about one point per pixel
-        place.plot(at[::every], means[::every], color=colour, lw=0.5, alpha=0.35)
+        place.plot(at[::every], means[::every], color=colour, lw=0.5, alpha=faint, zorder=1)
     shared = measures.on_grid(seeds, _POINTS)
     if shared is None:
         return
