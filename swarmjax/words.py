@@ -1,4 +1,6 @@
-"""Formats numbers in the output of commands: counts with their noun, and durations."""
+"""Formats numbers in the output of commands: counts with their noun, stages' numbers, durations."""
+
+from collections.abc import Sequence
 
 
 def count(number: int, noun: str, plural: str | None = None) -> str:
@@ -13,6 +15,13 @@ def count(number: int, noun: str, plural: str | None = None) -> str:
       Text such as `1 arena` or `1,024 arenas`.
     """
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}"
+
+
+def setting(value: float | Sequence[float] | None) -> str:
+    """Formats a number of a stage: `0.15`, the range `0.1 to 0.2`, or `any` for None."""
+    if value is None:
+        return "any"
+    return " to ".join(f"{end:g}" for end in (value if isinstance(value, Sequence) else [value]))
 
 
 def duration(seconds: float) -> str:

@@ -16,7 +16,7 @@ ROOMS = {
     "sim": {"config", "epuck"},
     "task": {"config", "epuck", "extension", "sim"},
     "ppo": {"config", "extension", "shards"},
-    "curriculum": {"config", "extension", "shards", "task"},
+    "curriculum": {"config", "extension", "shards", "task", "words"},
     "training": SHARED | {"sim", "task", "ppo", "curriculum", "shards"},
     "run": SHARED | {"sim", "task", "ppo", "curriculum", "training"},
     "evaluate": SHARED | {"sim", "task", "pages"},

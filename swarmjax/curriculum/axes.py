@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from swarmjax import words
 from swarmjax.config import ConfigError, show
 from swarmjax.task.layouts.site import NUMBERS
 from swarmjax.task.stage_files import complete
@@ -79,10 +80,7 @@ def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
 
 def _written(value: Any) -> str:
     """Writes a value as part of a stage's name, such as 0p15 or 0p1to0p2."""
-    if value is None:
-        return "any"
-    ends = value if isinstance(value, Sequence) else [value]
-    return "to".join(f"{end:g}" for end in ends).replace(".", "p").replace("-", "m")
+    return words.setting(value).replace(" ", "").replace(".", "p").replace("-", "m")
 
 
 def easier(axes: Mapping[str, Sequence[Any]], stages: int) -> np.ndarray:

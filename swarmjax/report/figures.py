@@ -50,7 +50,7 @@ def png_files(history: History) -> dict[str, bytes]:
 def mix(history: History) -> Figure:
     """Draws each stage's share of the arenas, stacked, as the mean over seeds."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
-    names = history.names
+    names = history.labels
     colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
     figure = Figure(figsize=(drawing.WIDTH, 4.2), layout="constrained")
     axes = figure.subplots()
@@ -147,7 +147,7 @@ def _mark(panel: Axes, history: History, stage: int) -> None:
     last, measured = report_rows.among(history.success[:, -1])
     share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
     small = len(history.names) > report_rows.MANY
-    drawing.dress(panel, f"{history.names[stage]}   {share}", 7 if small else 10)
+    drawing.dress(panel, f"{history.labels[stage]}   {share}", 7 if small else 10)
     if len(history.names) > 1:
         panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
 

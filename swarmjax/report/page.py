@@ -46,6 +46,7 @@ def page(
         is_wide=len(history.names) > report_rows.MANY,
         figures=figures,
         decisions=_decisions(history),
+        reweighed=words.count(sum("weights" in row for row in history.decisions), "time"),
         stages=_stages(history),
         **values,
     )
@@ -60,14 +61,15 @@ def _facts(history: History) -> list[tuple[str, str]]:
     Returns:
       The heading and the text of each line.
     """
-    trained, names = history.config, history.names
+    trained, names = history.config, history.labels
     options = files.flatten(to_dict(trained.curriculum))
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"
     stages = f"{len(names)}: {names[0]} to {names[-1]}" if len(names) > 1 else f"1: {names[0]}"
+    axes = f"; by {' · '.join(trained.curriculum.axes)}" if trained.curriculum.axes else ""
     return [
-        ("stages", stages),
+        ("stages", stages + axes),
         (
             "curriculum",
             ", ".join(f"{key}={value}" for key, value in options.items() if value is not None),
@@ -131,8 +133,9 @@ def _stages(history: History) -> list[tuple]:
         (
             stage.name,
             stage.robots,
+            words.setting(stage.distance),
             stage.obstacles,
-            " to ".join(f"{side:g}" for side in sorted(set(stage.sides))),
+            words.setting(stage.side),
             _percent(share[i]),
             *(_percent(last[f"{key}_by_stage"][0][i]) for key in ("success", "complete")),
             *(_number(last[f"{key}_by_stage"][0][i]) for key in ("contacts", "return")),

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmjax import words
 from swarmjax.config import ConfigError, reading
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import load_settings
@@ -96,6 +97,13 @@ class History:
     def names(self) -> list[str]:
         """The names of the stages."""
         return self.config.stage_names
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the stages in figures: along axes, the values of each stage."""
+        axes, stages = self.config.curriculum.axes, self.config.stage
+        values = [[words.setting(getattr(stage, key)) for key in axes] for stage in stages]
+        return list(map(" · ".join, values)) if axes else self.names
 
     @property
     def success(self) -> np.ndarray:

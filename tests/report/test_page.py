@@ -77,9 +77,9 @@ def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
     page = _page(history)
     unmeasured = "not measured, since no whole cohort has ended on it"
     assert page.fact("last stage") == unmeasured
-    assert page.fact("Promotions") == "None."
+    assert page.fact("Promotions") == "None. The shares of the stages changed 0 times."
     assert "min" not in page.fact("trained")
-    assert ["pair", "2", "0", "0.5", "100.0 %", "-", "-", "-", "-", "0 of 1"] in page.rows
+    assert ["pair", "2", "any", "0", "0.5", "100.0 %", "-", "-", "-", "-", "0 of 1"] in page.rows
 
 
 def test_a_single_seed_has_no_range(tmp_path: Path) -> None:
@@ -128,6 +128,7 @@ def test_stages_are_tabled_with_their_last_figures(tmp_path: Path) -> None:
     assert [
         "pair",
         "2",
+        "any",
         "0",
         "0.5",
         "87.5 %",
@@ -137,7 +138,21 @@ def test_stages_are_tabled_with_their_last_figures(tmp_path: Path) -> None:
         "-0.5",
         "1 of 1",
     ] in found
-    assert ["trio", "3", "2", "0.8", "12.5 %", "50.0 %", "25.0 %", "-", "2", "1 of 1"] in found
+    trio = ["trio", "3", "any", "2", "0.8", "12.5 %", "50.0 %", "25.0 %", "-", "2", "1 of 1"]
+    assert trio in found
+
+
+def test_stages_along_axes_are_labelled_by_their_values(tmp_path: Path) -> None:
+    decisions = [{"seed": 0, "update": 0, "why": "reweighed", "weights": {"pair": 1.0}}]
+    history = _history(tmp_path, [row(0)], decisions)
+    axes = replace(history.config.curriculum, axes={"robots": [2], "distance": []})
+    easy = replace(history.config.stage[0], distance=(0.1, 0.25))
+    stage = (easy, history.config.stage[1])
+    grid = replace(history, config=replace(history.config, curriculum=axes, stage=stage))
+    page = _page(grid)
+    assert grid.labels == ["2 · 0.1 to 0.25", "3 · any"]
+    assert page.fact("stages") == "2: 2 · 0.1 to 0.25 to 3 · any; by robots · distance"
+    assert page.fact("Promotions") == "None. The shares of the stages changed 1 time."
 
 
 def test_what_comes_from_outside_is_escaped(tmp_path: Path) -> None:
