@@ -12,6 +12,7 @@ Examples:
   python -m swarmjax.probe stage=s6 episodes=4096
 """
 
+import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -43,6 +44,7 @@ from swarmjax.training.rollout import Program
 
 _HEADS = {"targets": "targets, %", "any": "a robot arrives, %", "all": "all arrive, %"}
 _TAIL = (1 - CONFIDENCE) / 2
+_DEVIATIONS = 1.96  # of a normal distribution, with a tail of 2.5 % on each side
 
 
 class Counts(NamedTuple):
@@ -74,6 +76,17 @@ class Counts(NamedTuple):
     def expected(self, what: str, budget: int) -> Interval[float]:
         """Returns how many of the episodes in a budget of control steps are such by chance."""
         return Interval(*(p * budget * self.episodes / self.steps for p in self.share(what)))
+
+    def deciding(self, what: str, budget: int) -> float:
+        """Returns how many episodes would show whether the budget has at least one such episode.
+
+        It takes the chance that was counted as the true one. Its interval excludes one episode in
+        the budget by then: an exact interval if there was none, else a normal one.
+        """
+        chance, one = self.share(what).estimate, self.steps / (budget * self.episodes)
+        if not chance:
+            return -math.log(_TAIL) / one
+        return _DEVIATIONS**2 * chance / (chance - one) ** 2 if chance != one else math.inf
 
     def product(self, budget: int) -> float:
         """Returns the most episodes in a budget to expect with all robots at their targets at once.
@@ -239,9 +252,10 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
             f"{says} none in {last.episodes:,} episodes, and fewer than {_number(most)} in the "
             f"budget if each robot comes to its target independently of the others: {use}"
         )
+    enough = _number(last.deciding(signal, settings.budget))
     return (
         f"{says} {low} to {high} such episodes in the budget, which leaves {name} alone undecided: "
-        f"give more than episodes={settings.episodes}, or {use}"
+        f"about {enough} episodes would decide (episodes), or {use}"
     )
 
 

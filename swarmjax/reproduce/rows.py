@@ -206,7 +206,9 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
         by_seed[row["seed"]].append(row)
     for seed, rows in by_seed.items():
         if not rows:
-            raise ConfigError(f"{run / EPISODES} has no episode of seed {seed}.")
+            raise ConfigError(
+                f"{run / EPISODES} has no whole episode of seed {seed}: give a larger budget."
+            )
     return tuple(_log(by_seed[seed]) for seed in seeds)
 
 

@@ -117,7 +117,10 @@ REFUSED = {
         lambda out: (out / "baseline" / "episodes.jsonl").unlink(),
         "baseline has no episodes.jsonl",
     ),
-    "a seed": (lambda out: _drop(out, '"seed": 2'), "no episode of seed 2"),
+    "a seed": (
+        lambda out: _drop(out, '"seed": 2'),
+        "no whole episode of seed 2: give a larger budget",
+    ),
     "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
     "lengths": (lambda out: _append(out, sensed=[1]), "has no list of 2 whole numbers as sensed"),
     "no robots": (lambda out: _append(out, robots=0), "as reached"),
