@@ -5,6 +5,7 @@ from typing import Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, setting, show
+from swarmjax.sim import sensors
 
 # m; a level leaves passages of 0.10 m (task/stage_config.py). A robot of this radius fits through
 # with a tenth of the passage to spare.
@@ -97,6 +98,29 @@ class RobotConfig(Section):
         reason=_TURN_REASON,
     )
 
+    sensor_poses: tuple[sensors.Pose, ...] = setting(
+        epuck.SENSOR_POSES,
+        "x (m), y (m) and yaw (rad) of each infrared sensor, in order",
+        -sensors.MOST_YAW,
+        sensors.MOST_YAW,
+    )
+    sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
+    sensor_height: float = setting(
+        epuck.SENSOR_HEIGHT,
+        "height of the infrared sensors, within that of every hull, m",
+        above=epuck.HULL_BOTTOM,
+        below=epuck.HULL_TOP,
+    )
+    sensor_tilt: float = setting(
+        epuck.SENSOR_TILT, "upward tilt of the infrared rays, rad", -1.0, 1.0
+    )
+    sensor_response: tuple[sensors.Point, ...] = setting(
+        epuck.INFRARED_TABLE,
+        "ray length (m), value and relative deviation, for realism.infrared=webots",
+        0.0,
+        sensors.MOST_VALUE,
+    )
+
     @property
     def grip_track(self) -> float:
         """Distance between the points where the wheels grip, m."""
@@ -118,6 +142,8 @@ class RobotConfig(Section):
                     f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
                     f"inside the hull: give less than {show(most * hull)}."
                 )
+        sensors.check_poses(self.sensor_poses, hull, self.sensor_range)
+        sensors.check_response(self.sensor_response)
         # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
         # axle.
         wheels = 2 * (epuck.WHEEL_INERTIA[2] + epuck.WHEEL_MASS * epuck.AXLE_Y**2)

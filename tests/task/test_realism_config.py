@@ -230,7 +230,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "is 0.037 and the wheels lie inside the hull: give less than 0.074."),
         (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give "
          "0.001 or more, less than 0.03."),
-        (["robot.hull_radius=0.029", "robot.wheel_radius=0.02",
+        (["robot.hull_radius=0.029", "robot.sensor_poses=[[0.02,0,0]]",
           "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
          "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
         # The wheels have 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6.
