@@ -62,6 +62,8 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     names = {item.name for item in fields(RobotConfig)}
     robot = {key: value for key, value in meta["robot"].items() if key in names}
     robot["max_speed"], robot["max_turn_rate"] = meta["action"]["high"][:2]
+    if robot["max_speed"] > robot["wheel_radius"] * robot["max_wheel_speed"]:
+        robot.setdefault("wheel_limit", "clip")  # as in files that are older than this key
     robot |= {
         name: meta["sensors"][key] for key, name in _SENSORS.items() if key in meta["sensors"]
     }

@@ -23,6 +23,7 @@ _FASTEST_TURN = 50.0  # rad/s
 _TURN_REASON = "a faster turn makes more than one rotation in a control step of 0.128 s"
 FASTEST_WHEEL = 1000.0  # rad/s
 MOST_FRICTION = 10.0
+_ROUNDING = 1e-6  # relative; of a product of decimal numbers
 FRICTION_REASON = "rubber on rubber has less than 2"
 # With less friction, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
 # The crowds of tests/sim/test_rubbing.py were off by 1e-4 with friction 0.1 and by 1e-3 with 0.05,
@@ -90,6 +91,9 @@ class RobotConfig(Section):
         _FASTEST,
         reason=_SPEED_REASON,
     )
+    wheel_limit: Literal["refuse", "clip"] = setting(
+        "refuse", "a max_speed beyond the wheels' speed limit: refuse it, or clip what is driven"
+    )
     max_turn_rate: float = setting(
         epuck.MAX_TURN_RATE,
         "limit of the turn command in both directions, rad/s",
@@ -142,6 +146,13 @@ class RobotConfig(Section):
                     f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
                     f"inside the hull: give less than {show(most * hull)}."
                 )
+        reach = self.wheel_radius * self.max_wheel_speed
+        if self.wheel_limit == "refuse" and self.max_speed > reach * (1 + _ROUNDING):
+            raise ConfigError(
+                f"max_speed is {show(self.max_speed)}, but wheels of {show(self.wheel_radius)} m "
+                f"at {show(self.max_wheel_speed)} rad/s reach {show(reach)} m/s: give at most "
+                "that, or wheel_limit=clip, with which the robot drives no faster."
+            )
         sensors.check_poses(self.sensor_poses, hull, self.sensor_range)
         sensors.check_response(self.sensor_response)
         # For each wheel: its inertia about its own upright axis, plus that of a point mass on the

@@ -158,7 +158,7 @@ def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius that no draw exceeds.
+      The robot, with a wheel radius that no draw exceeds; its speeds are not for driving.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
-    return replace(robot, wheel_radius=most)
+    return replace(robot, wheel_radius=most, wheel_limit="clip")
