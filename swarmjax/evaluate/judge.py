@@ -89,7 +89,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
-    if config.stage.kind is not None:
+    if room.must_check(config.stage, spacing.hull_radius):
         room.check_level(config.stage, example, spacing)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)

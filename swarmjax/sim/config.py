@@ -7,13 +7,11 @@ from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim import sensors
 
-# m; a level leaves passages of 0.10 m (task/stage_config.py). A robot of this radius fits through
-# with a tenth of the passage to spare.
-LARGEST_HULL = 0.045
+# m; passages follow the hull (`passage` in task/stage_config.py). A passage of this hull is 0.41 m
+# wide, a tenth of the largest arena.
+LARGEST_HULL = 0.15
 _HULL_REASON = (
-    "levels leave passages of 0.10 m, and a larger robot would not fit through them. To train "
-    "larger ones, raise PASSAGE in swarmjax/task/stage_config.py and LARGEST_HULL in "
-    "swarmjax/sim/config.py together"
+    "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
 )
 # Limits for MuJoCo's geometry, float32 and arenas of 0.4 to 4 m. An e-puck drives at 0.13 m/s.
 LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of the numbers that are used as divisors
@@ -47,9 +45,8 @@ class RobotConfig(Section):
         high=LARGEST_HULL,
         reason=_HULL_REASON,
     )
-    mass: float = setting(
-        epuck.MASS, "mass including wheels, kg", above=2 * epuck.WHEEL_MASS, high=100.0
-    )
+    mass: float = setting(epuck.MASS, "mass including wheels, kg", above=0.0, high=100.0)
+    wheel_mass: float = setting(epuck.WHEEL_MASS, "mass of each wheel, kg", 1e-6, 10.0)
     yaw_inertia: float = setting(
         epuck.YAW_INERTIA, "moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0
     )
@@ -130,6 +127,15 @@ class RobotConfig(Section):
         """Distance between the points where the wheels grip, m."""
         return self.track if self.effective_track is None else self.effective_track
 
+    @property
+    def wheel_inertia(self) -> list[float]:
+        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the mass.
+
+        The radius is left out. About the axle, the motor's inertia outweighs the wheel by far, and
+        about the upright axis the body takes the rest of `yaw_inertia`.
+        """
+        return [self.wheel_mass / epuck.WHEEL_MASS * part for part in epuck.WHEEL_INERTIA]
+
     def _check(self) -> None:
         object.__setattr__(self, "effective_track", self.grip_track)
         if 0.0 < self.hull_friction < LEAST_HULL_FRICTION:
@@ -155,9 +161,14 @@ class RobotConfig(Section):
             )
         sensors.check_poses(self.sensor_poses, hull, self.sensor_range)
         sensors.check_response(self.sensor_response)
+        if self.mass <= 2 * self.wheel_mass:
+            raise ConfigError(
+                f"mass is {show(self.mass)}, but wheel_mass is {show(self.wheel_mass)} and the "
+                f"mass includes two wheels: give more than {show(2 * self.wheel_mass)}."
+            )
         # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
         # axle.
-        wheels = 2 * (epuck.WHEEL_INERTIA[2] + epuck.WHEEL_MASS * epuck.AXLE_Y**2)
+        wheels = 2 * (self.wheel_inertia[2] + self.wheel_mass * (0.5 * self.track) ** 2)
         if self.body == "wheeled" and self.yaw_inertia <= wheels:
             raise ConfigError(
                 f"yaw_inertia is {show(self.yaw_inertia)}, but body is wheeled and its wheels "

@@ -188,7 +188,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "reach 0.1256 m/s: give at most that, or wheel_limit=clip, with which the robot drives "
          "no faster."),
         (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
-         "0.045."),
+         "0.15."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),

@@ -1,7 +1,10 @@
 """Tests what is refused about the sensors of a robot of one's own."""
 
+import dataclasses
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 from policies import saved
 from sentences import refusal
@@ -10,8 +13,10 @@ from swarmjax.evaluate import judge
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.policy import PolicyError
 from swarmjax.run.load_settings import load_train
+from swarmjax.sim import model, response
 from swarmjax.sim.config import RobotConfig
-from swarmjax.task import observation
+from swarmjax.task import observation, room
+from swarmjax.task.level import Spacing
 from swarmjax.task.stage_config import StageConfig
 
 ONE = "[[0.03,0,0]]"
@@ -70,3 +75,31 @@ def test_the_observation_has_an_entry_for_each_sensor() -> None:
     names = observation.layout("metric", sensors=3).names
     assert names == ("infrared_0", "infrared_1", "infrared_2", "target_distance", "target_bearing")
     assert observation.layout("metric").names == observation.NAMES
+
+
+@pytest.mark.parametrize("name", ["khepera4", "thymio2"])
+def test_another_robot_has_its_mass_its_inertia_and_readings(name: str) -> None:
+    robot = load_train([f"robot={name}"]).robot
+    built = model.build(robot, model.ArenaSize(1, 0, 0.05), 0.016, ray_geoms=True).compile()
+    assert built.body_mass.sum() == pytest.approx(robot.mass, rel=1e-12)
+    data = mujoco.MjData(built)
+    full = np.zeros((built.nv, built.nv))
+    mujoco.mj_forward(built, data)
+    mujoco.mj_fullM(built, data, full)
+    assert full[5, 5] == pytest.approx(robot.yaw_inertia, rel=1e-9)  # the sixth axis is yaw
+    table = response.table(robot.sensor_response, robot.sensor_tilt)
+    for length, value, _ in robot.sensor_response:
+        ray = np.array([length])
+        assert response.expected("webots", ray, np, table)[0] == pytest.approx(value)
+        back = response.distance("webots", np.array([float(value)]), np, table)[0]
+        assert back == pytest.approx(length, abs=1e-9)
+
+
+@pytest.mark.parametrize(("hull", "side"), [(0.07, 1.5), (0.15, 3.2)])
+def test_levels_hold_larger_robots(hull: float, side: float) -> None:
+    stage = StageConfig(name="wide", robots=4, obstacles=2, side=side)
+    spacing = Spacing(4, 2, hull, 0.05)
+    room.check([stage], spacing)  # draws levels, and refuses a robot that touches anything
+    own = dataclasses.replace(stage, side=1.0)
+    least = refusal(room.check, [own], spacing).rsplit(" ", 1)[1]
+    assert 1.0 < float(least.rstrip(".")) <= side
