@@ -3,7 +3,7 @@
 Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. They raise
 `SwarmjaxError` for what they refuse. Importing this package imports neither JAX nor NumPy.
 
-Every docstring uses these axes: `T` time, `A` arenas, `R` robots (max), `K` = 8 infrared sensors,
+Every docstring uses these axes: `T` time, `A` arenas, `R` robots (max), `K` infrared sensors,
 `O` observation, `U` = 2 command, `M` obstacles (max), `S` stages, `L` learners (1 when the policy
 is shared, R when every robot has its own). Units are SI. Angles are in radians and
 counter-clockwise, and x points forward. A step is always qualified: a physics step, a control step

@@ -20,7 +20,12 @@ _NAMES = {
     bool: "true or false",
     types.NoneType: "null",
 }
-_LISTS = {int: "[64,64]", str: "[s1,s2]", float | tuple[float, float]: "[0.7,[0.8,1.2]]"}
+_LISTS = {
+    int: "[64,64]",
+    str: "[s1,s2]",
+    float | tuple[float, float]: "[0.7,[0.8,1.2]]",
+    tuple[float, float, float]: "[[0.03,-0.01,-0.3],[0.03,0.01,0.3]]",
+}
 
 
 class ConfigError(ValueError):
@@ -34,7 +39,7 @@ def options(hint: object) -> tuple[Any, ...]:
 
 
 def is_range(hint: object) -> bool:
-    """Returns whether a type is a range: two numbers, the lower first."""
+    """Returns whether a type is a range (two numbers, the lower first) or a row of more."""
     return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
 
 
@@ -61,7 +66,7 @@ def convert_single(hint: object, value: object, key: str) -> object:
             made = _convert(option, value)
         except (TypeError, ValueError, OverflowError):
             continue
-        if isinstance(made, tuple) and made[0] > made[1]:
+        if len(values := made if isinstance(made, tuple) else ()) == 2 and values[0] > values[1]:
             raise ConfigError(f"{key} is {show(value)}: give the lower number first.")
         return made
     raise ConfigError(f"{key} is {show(value)}: give {describe(hint)}.")
@@ -73,8 +78,9 @@ def _convert(hint: object, value: object) -> object:
         if isinstance(value, str) and value in typing.get_args(hint):
             return value
     elif is_range(hint):
-        if isinstance(value, list | tuple) and len(value) == 2:
-            return tuple(_number(typing.get_args(hint)[0], number) for number in value)
+        kinds = typing.get_args(hint)
+        if isinstance(value, list | tuple) and len(value) == len(kinds):
+            return tuple(map(_number, kinds, value))
     elif hint is int or hint is float:
         return _number(hint, value)
     elif isinstance(hint, type) and isinstance(value, hint) and value != "":
@@ -125,8 +131,9 @@ def describe(hint: object, bounds: str = "") -> str:
         elif typing.get_origin(option) is Literal:
             words += inner
         elif is_range(option):
-            whole = "whole " if inner[0] is int else ""
-            words.append(f"a range [low,high] of {whole}numbers{bounds}")
+            whole, count = "whole " if inner[0] is int else "", len(inner)
+            start = "a range [low,high] of" if count == 2 else f"{count}"
+            words.append(f"{start} {whole}numbers{bounds}")
         else:
             words.append(_NAMES[option] + (bounds if option in (int, float) else ""))
     *most, last = words

@@ -138,7 +138,8 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         x.astype(np.float64) for x in (begun.start, begun.target, begun.obstacle)
     )
     realism, boxes = judge.config.realism, obstacle.shape[1]
-    factors = task_factors.draw(begun.seed, realism, judge.spacing.robots, boxes, np)
+    robots, sensors = judge.spacing.robots, len(judge.config.robot.sensor_poses)
+    factors = task_factors.draw(begun.seed, realism, robots, boxes, np, sensors)
     model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, begun.side, strict=True)]
@@ -256,7 +257,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         arrived=arrived,
         begins=begins,
         touches=touches,
-        sensed=(sight.ray < task.sensor_range).any(axis=-1),
+        sensed=(sight.ray < judge.config.robot.sensor_range).any(axis=-1),
     )
     outcome = measures.tally(arenas.outcome, events, np)
     return arenas._replace(memory=memory, pose=pose, observation=seen, apart=apart, outcome=outcome)

@@ -8,7 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from swarmjax import extension
+from swarmjax import epuck, extension
+from swarmjax.config import show
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.rays import RayScene
 from swarmjax.extension import Extensions, LevelDrawing, Observation
@@ -17,6 +18,7 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import physics_substeps
+from swarmjax.sim.sensors import Pose
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, room
@@ -87,11 +89,13 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
     robots, obstacles = config.stage.robots, config.stage.obstacles
     spacing = level.Spacing(robots, obstacles, config.robot.hull_radius, config.task.target_radius)
     example = draw_level(stage, spacing, config.seed, 0, extensions.levels)
-    if config.stage.kind is not None:
+    if room.must_check(config.stage, spacing.hull_radius):
         room.check_level(config.stage, example, spacing)
     compiled, ids = _compile(config, example.obstacle[:, 3:] if half is None else half)
     geom_robot, geom_kind = _geoms(compiled, ids)
-    electronics = task_electronics.load(config.task, config.realism, trained.encoding, own)
+    electronics = task_electronics.load(
+        config.task, config.realism, trained.encoding, own, config.robot
+    )
     return Judge(
         config=config,
         policy=trained,
@@ -106,7 +110,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
         scene=RayScene(
             model=compiled,
             ids=ids,
-            hull_radius=config.robot.hull_radius,
+            robot=config.robot,
             side=config.stage.sides[0],
             reach=electronics.reach,
         ),
@@ -194,8 +198,9 @@ def check_policy(
     if stage.level in needs.get("level", {}):
         extension.check_needs(needs, extensions, str(path), ["level"])
     layout = trained.meta["observation"]
-    own = _observations(extensions, trained)
-    for key, expected in observation.describe(trained.encoding, own).items():
+    own, poses = _observations(extensions, trained), config.robot.sensor_poses
+    _check_sensors(path, trained, poses)
+    for key, expected in observation.describe(trained.encoding, own, len(poses)).items():
         given = layout.get(key)
         if given != expected:
             raise PolicyError(
@@ -207,6 +212,17 @@ def check_policy(
         raise PolicyError(
             f"{path} holds a network for each of {learners} robots, but stage {stage.name} has "
             f"{stage.robots}: give a shared policy, or a stage of 1 to {learners}."
+        )
+
+
+def _check_sensors(path: str | None, trained: Policy, poses: Sequence[Pose]) -> None:
+    """Refuses a policy that was trained with other sensors."""
+    theirs = trained.meta.get("sensors", {}).get("poses", epuck.SENSOR_POSES)
+    if [*map(tuple, theirs)] != [*map(tuple, poses)]:
+        raise PolicyError(
+            f"{path} was trained with other sensors: its meta.sensors.poses is {show(theirs)}, but "
+            f"robot.sensor_poses is {show(poses)}; leave robot and robot.sensor_poses as trained, "
+            "or train a policy for this robot."
         )
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from swarmjax import epuck
 from swarmjax.sim import infrared
 from swarmjax.sim import model as sim_model
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
 
 # Rays pass through contact spheres, wheels, skids and floor.
@@ -21,14 +21,14 @@ class RayScene:
     Attributes:
       model: The compiled arena.
       ids: Rows of the model's moving bodies.
-      hull_radius: Radius of the hulls, m.
+      robot: The robots, with their hulls and sensors.
       side: Side of the smallest arena, m.
       reach: Length of the rays, m.
     """
 
     model: mujoco.MjModel
     ids: sim_model.Ids
-    hull_radius: float
+    robot: RobotConfig
     side: float
     reach: float
 
@@ -59,12 +59,12 @@ def cast_rays(
       of the electronics; and the geom that the ray meets, -1 if none.
     """
     limit = scene.reach
-    origin, direction = infrared.rays(pose, np, yaw)
+    origin, direction = infrared.rays(pose, np, infrared.Mount(scene.robot.sensor_poses, yaw))
     near = _near(scene, origin + 0.5 * limit * direction, pose[..., :2], obstacle)
     arena, robot, _ = np.nonzero(near)
     origin, direction = origin[near], direction[near]
     flat = np.zeros((len(origin), 1))
-    origin = np.concatenate([origin, flat + epuck.SENSOR_HEIGHT], axis=-1)
+    origin = np.concatenate([origin, flat + scene.robot.sensor_height], axis=-1)
     toward = np.concatenate([direction, flat, -direction, flat], axis=-1)
     distance, normal = np.zeros((len(origin), 2)), np.zeros_like(toward)
     met = np.full((len(origin), 2), -1, np.int32)
@@ -121,7 +121,7 @@ def _near(
       [A, R, K].
     """
     myself = np.eye(place.shape[-2], dtype=bool)[:, None]
-    robots = _apart(middle, place) - scene.hull_radius
+    robots = _apart(middle, place) - scene.robot.hull_radius
     boxes = _apart(middle, obstacle[..., :2])
     boxes -= np.linalg.norm(obstacle[:, None, None, :, 3:], axis=-1)
     wall = 0.5 * scene.side - np.abs(middle).max(axis=-1)

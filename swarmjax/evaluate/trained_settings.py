@@ -22,6 +22,14 @@ from swarmjax.task.config import TaskConfig, describe
 
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "arrival", "observations")
+# Keys of the robot that a policy file holds in `meta.sensors`.
+_SENSORS = {
+    "poses": "sensor_poses",
+    "range": "sensor_range",
+    "height": "sensor_height",
+    "tilt": "sensor_tilt",
+    "table": "sensor_response",
+}
 _SHOWN = ("robot", "task", "realism")  # sections whose typed keys the printed line repeats
 
 
@@ -54,8 +62,12 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
     names = {item.name for item in fields(RobotConfig)}
     robot = {key: value for key, value in meta["robot"].items() if key in names}
     robot["max_speed"], robot["max_turn_rate"] = meta["action"]["high"][:2]
+    if robot["max_speed"] > robot["wheel_radius"] * robot["max_wheel_speed"]:
+        robot.setdefault("wheel_limit", "clip")  # as in files that are older than this key
+    robot |= {
+        name: meta["sensors"][key] for key, name in _SENSORS.items() if key in meta["sensors"]
+    }
     task = {key: meta["task"][key] for key in _TASK if key in meta["task"]}
-    task["sensor_range"] = meta["sensors"]["range"]
     return Trained(
         robot=build(RobotConfig, robot, f"{path}: meta.robot."),
         task=build(TaskConfig, task, f"{path}: meta.task."),

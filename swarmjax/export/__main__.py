@@ -138,6 +138,12 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
         )
     if form != "webots":
         return
+    poses = meta["sensors"].get("poses", epuck.SENSOR_POSES)
+    if [*map(tuple, poses)] != [*epuck.SENSOR_POSES]:
+        raise PolicyError(
+            f"format is webots, whose controller drives an e-puck, but the policy's robot has "
+            f"{len(poses)} other sensors: give format=c or onnx, and your own controller."
+        )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:
@@ -155,7 +161,7 @@ def _check_range(meta: Mapping[str, Any]) -> None:
         raise ConfigError(
             f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
             f"Webots' sensors measure distances only to {farthest:g} m: train with "
-            f"task.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
+            f"robot.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
         )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from swarmjax import epuck, provenance
+from swarmjax import provenance
 from swarmjax.pages import builder
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
@@ -38,13 +38,13 @@ def page(
         "facts": _facts(settings, policies, words),
         "step": task.control_step,
         "kinds": list(gaps.KINDS),
-        "sensors": epuck.SENSORS,
+        "sensors": len(settings.robot.sensor_poses),
         "hull": settings.robot.hull_radius,
-        "range": task.sensor_range,
+        "range": settings.robot.sensor_range,
         "targetRadius": task.target_radius,
         "arrival": task.arrival,
     }
-    packed = pack.pack(header, episodes, task.sensor_range)
+    packed = pack.pack(header, episodes, settings.robot.sensor_range)
     return fill(f"Replay of {' and '.join(settings.policies)} on {_levels(settings)}", packed)
 
 

@@ -121,7 +121,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     """
     earning = weights(judge.policy, judge.config.task)
     arenas = engine_c.start(judge, levels)
-    yaw = arenas.factors.infrared_yaw
+    yaw, poses = arenas.factors.infrared_yaw, judge.config.robot.sensor_poses
     frames = [_look(judge, arenas)]
     over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
     memory = policy.begin(judge.policy, arenas.pose.shape[:2])
@@ -135,7 +135,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
         _cut(
             every.take(np.s_[:, i]),
             level,
-            _scene(level, None if yaw is None else yaw[i]),
+            _scene(level, infrared.Mount(poses, None if yaw is None else yaw[i])),
             judge,
             earning,
         )
@@ -174,7 +174,7 @@ def _cut(
         distance_before=frames.distance[:-1],
         distance=frames.distance[1:],
         infrared=frames.ray[1:],
-        sensor_range=task.sensor_range,
+        sensor_range=judge.config.robot.sensor_range,
         arrives=arrival.arrives(task.arrival, before, frames.arrived[1:], present),
         contact_begins=np.diff(frames.contacts, axis=0),
         touching=frames.touching[1:],
@@ -186,7 +186,7 @@ def _cut(
     earned = reward.weighted(steps, earning)
     none = np.zeros_like(frames.distance[:1])
     return Recording(
-        **vars(frames) | {"ray": np.minimum(frames.ray, task.sensor_range)},
+        **vars(frames) | {"ray": np.minimum(frames.ray, judge.config.robot.sensor_range)},
         scene=scene,
         reward={
             name: np.concatenate([none, np.where(active, term, 0.0)])
@@ -218,10 +218,10 @@ def _since(arrived: np.ndarray) -> np.ndarray:
     return np.where(arrived[-1], away + 1, 0)
 
 
-def _scene(level: Level, yaw: np.ndarray | None) -> ReplayScene:
-    """Records the fixed parts of an arena, whose sensors are turned by `yaw` [R, K], rad."""
+def _scene(level: Level, mount: infrared.Mount) -> ReplayScene:
+    """Records the fixed parts of an arena."""
     at_origin = np.zeros((len(level.target), 3))
-    origin, toward = infrared.rays(at_origin, np, yaw)
+    origin, toward = infrared.rays(at_origin, np, mount)
     return ReplayScene(
         side=float(level.side),
         target=level.target.astype(float),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmjax import epuck, extension, policy_file, provenance
+from swarmjax import extension, policy_file, provenance
 from swarmjax.config import inherit, to_dict
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import MIN_STD, OBSERVATION_LIMIT
@@ -63,7 +63,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
     robot = trained.robot
     encoding = resolve_encoding(trained.task, trained.realism)
     chosen = pieces.choose(extension.load(trained.extensions), trained.task, trained.stage)
-    described = observation.describe(encoding, chosen.observations)
+    described = observation.describe(encoding, chosen.observations, len(robot.sensor_poses))
     algo = trained.algo
     optional: dict[str, Any] = {"network": algo.network} if _has_own_network(algo) else {}
     if algo.memory != "none":
@@ -81,15 +81,16 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         },
         "robot": {
             "preset": inherit.preset_of("robot", robot),
-            **to_dict(robot),
+            **{k: v for k, v in to_dict(robot).items() if not k.startswith("sensor_")},
         },
         "sensors": {
             "preset": inherit.preset_of("realism", trained.realism),
             "response": trained.realism.infrared,
-            "range": trained.task.sensor_range,
-            "poses": [list(pose) for pose in epuck.SENSOR_POSES],
-            "height": epuck.SENSOR_HEIGHT,
-            "tilt": epuck.SENSOR_TILT,
+            "range": robot.sensor_range,
+            "poses": [list(pose) for pose in robot.sensor_poses],
+            "height": robot.sensor_height,
+            "tilt": robot.sensor_tilt,
+            "table": [list(point) for point in robot.sensor_response],
         },
         "task": {key: getattr(trained.task, key) for key in _TASK}
         | {"observations": [piece.name for piece in chosen.observations]},

@@ -106,6 +106,12 @@ def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
         )
     pieces, kinds = extension.load(settings.extensions), ["observation", "network"]
     extension.check_needs(stored.pieces, pieces, settings.init_from or "", kinds)
+    sensors = [len(each.robot.sensor_poses) for each in (stored, settings)]
+    if sensors[0] != sensors[1]:
+        raise ConfigError(
+            f"init_from is {given}, whose robot has {sensors[0]} sensors, but here robot has "
+            f"{sensors[1]}: give a robot with as many, or another run."
+        )
     mine, theirs = _networks(settings), _networks(stored)
     for key, held in theirs.items():
         if held != mine.get(key, held):

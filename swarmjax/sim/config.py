@@ -5,14 +5,13 @@ from typing import Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, setting, show
+from swarmjax.sim import sensors
 
-# m; a level leaves passages of 0.10 m (task/stage_config.py). A robot of this radius fits through
-# with a tenth of the passage to spare.
-LARGEST_HULL = 0.045
+# m; passages follow the hull (`passage` in task/stage_config.py). A passage of this hull is 0.41 m
+# wide, a tenth of the largest arena.
+LARGEST_HULL = 0.15
 _HULL_REASON = (
-    "levels leave passages of 0.10 m, and a larger robot would not fit through them. To train "
-    "larger ones, raise PASSAGE in swarmjax/task/stage_config.py and LARGEST_HULL in "
-    "swarmjax/sim/config.py together"
+    "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
 )
 # Limits for MuJoCo's geometry, float32 and arenas of 0.4 to 4 m. An e-puck drives at 0.13 m/s.
 LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of the numbers that are used as divisors
@@ -22,6 +21,7 @@ _FASTEST_TURN = 50.0  # rad/s
 _TURN_REASON = "a faster turn makes more than one rotation in a control step of 0.128 s"
 FASTEST_WHEEL = 1000.0  # rad/s
 MOST_FRICTION = 10.0
+_ROUNDING = 1e-6  # relative; of a product of decimal numbers
 FRICTION_REASON = "rubber on rubber has less than 2"
 # With less friction, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
 # The crowds of tests/sim/test_rubbing.py were off by 1e-4 with friction 0.1 and by 1e-3 with 0.05,
@@ -45,9 +45,8 @@ class RobotConfig(Section):
         high=LARGEST_HULL,
         reason=_HULL_REASON,
     )
-    mass: float = setting(
-        epuck.MASS, "mass including wheels, kg", above=2 * epuck.WHEEL_MASS, high=100.0
-    )
+    mass: float = setting(epuck.MASS, "mass including wheels, kg", above=0.0, high=100.0)
+    wheel_mass: float = setting(epuck.WHEEL_MASS, "mass of each wheel, kg", 1e-6, 10.0)
     yaw_inertia: float = setting(
         epuck.YAW_INERTIA, "moment of inertia about the vertical axis, kg m^2", 1e-8, 10.0
     )
@@ -89,6 +88,9 @@ class RobotConfig(Section):
         _FASTEST,
         reason=_SPEED_REASON,
     )
+    wheel_limit: Literal["refuse", "clip"] = setting(
+        "refuse", "a max_speed beyond the wheels' speed limit: refuse it, or clip what is driven"
+    )
     max_turn_rate: float = setting(
         epuck.MAX_TURN_RATE,
         "limit of the turn command in both directions, rad/s",
@@ -97,10 +99,42 @@ class RobotConfig(Section):
         reason=_TURN_REASON,
     )
 
+    sensor_poses: tuple[sensors.Pose, ...] = setting(
+        epuck.SENSOR_POSES,
+        "x (m), y (m) and yaw (rad) of each infrared sensor, in order",
+        -sensors.MOST_YAW,
+        sensors.MOST_YAW,
+    )
+    sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
+    sensor_height: float = setting(
+        epuck.SENSOR_HEIGHT,
+        "height of the infrared sensors, within that of every hull, m",
+        above=epuck.HULL_BOTTOM,
+        below=epuck.HULL_TOP,
+    )
+    sensor_tilt: float = setting(
+        epuck.SENSOR_TILT, "upward tilt of the infrared rays, rad", -1.0, 1.0
+    )
+    sensor_response: tuple[sensors.Point, ...] = setting(
+        epuck.INFRARED_TABLE,
+        "ray length (m), value and relative deviation, for realism.infrared=webots",
+        0.0,
+        sensors.MOST_VALUE,
+    )
+
     @property
     def grip_track(self) -> float:
         """Distance between the points where the wheels grip, m."""
         return self.track if self.effective_track is None else self.effective_track
+
+    @property
+    def wheel_inertia(self) -> list[float]:
+        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the mass.
+
+        The radius is left out. About the axle, the motor's inertia outweighs the wheel by far, and
+        about the upright axis the body takes the rest of `yaw_inertia`.
+        """
+        return [self.wheel_mass / epuck.WHEEL_MASS * part for part in epuck.WHEEL_INERTIA]
 
     def _check(self) -> None:
         object.__setattr__(self, "effective_track", self.grip_track)
@@ -118,9 +152,23 @@ class RobotConfig(Section):
                     f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
                     f"inside the hull: give less than {show(most * hull)}."
                 )
+        reach = self.wheel_radius * self.max_wheel_speed
+        if self.wheel_limit == "refuse" and self.max_speed > reach * (1 + _ROUNDING):
+            raise ConfigError(
+                f"max_speed is {show(self.max_speed)}, but wheels of {show(self.wheel_radius)} m "
+                f"at {show(self.max_wheel_speed)} rad/s reach {show(reach)} m/s: give at most "
+                "that, or wheel_limit=clip, with which the robot drives no faster."
+            )
+        sensors.check_poses(self.sensor_poses, hull, self.sensor_range)
+        sensors.check_response(self.sensor_response)
+        if self.mass <= 2 * self.wheel_mass:
+            raise ConfigError(
+                f"mass is {show(self.mass)}, but wheel_mass is {show(self.wheel_mass)} and the "
+                f"mass includes two wheels: give more than {show(2 * self.wheel_mass)}."
+            )
         # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
         # axle.
-        wheels = 2 * (epuck.WHEEL_INERTIA[2] + epuck.WHEEL_MASS * epuck.AXLE_Y**2)
+        wheels = 2 * (self.wheel_inertia[2] + self.wheel_mass * (0.5 * self.track) ** 2)
         if self.body == "wheeled" and self.yaw_inertia <= wheels:
             raise ConfigError(
                 f"yaw_inertia is {show(self.yaw_inertia)}, but body is wheeled and its wheels "

@@ -1,12 +1,13 @@
-"""Eight infrared rays per robot, computed from the geometry of walls, discs and turned boxes.
+"""The infrared rays of robots, computed from the geometry of walls, discs and turned boxes.
 
 There is one function per shape. Each function returns the distance at which a ray meets the shape,
-`inf` for a miss, and 0 for a ray that starts inside. Sensors sit 3.5 to 6 mm behind the hull's
-surface, so a robot pressed against an object has its sensor inside that object. Runs on NumPy or
-JAX.
+`inf` for a miss, and 0 for a ray that starts inside. The e-puck's sensors sit 3.5 to 6 mm
+behind the hull's surface, so a robot pressed against an object has its sensor inside that object.
+Runs on NumPy or JAX.
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,21 @@ from swarmjax import epuck
 from swarmjax.sim.dispatch import least, pieces
 
 Array = Any
-SENSOR_POSES = np.array(epuck.SENSOR_POSES, np.float32)
+
+
+class Mount(NamedTuple):
+    """How the sensors of robots are mounted.
+
+    Attributes:
+      poses: x (m), y (m) and yaw (rad) of each sensor in the frame of the robot.
+      turn: [..., K] by how much each sensor is turned to the left of its nominal yaw, rad; None: 0.
+    """
+
+    poses: Sequence[Sequence[float]] = epuck.SENSOR_POSES
+    turn: Array | None = None
+
+
+EPUCK = Mount()
 
 
 class Reflectance(NamedTuple):
@@ -70,29 +85,30 @@ class Box(NamedTuple):
         return Box(*(part[index] for part in self))
 
 
-def rays(pose: Array, xp: Any, yaw: Array | None = None) -> tuple[Array, Array]:
+def rays(pose: Array, xp: Any, mount: Mount = EPUCK) -> tuple[Array, Array]:
     """Places the rays of robots in the world.
 
     Args:
       pose: [..., 3] x (m), y (m), yaw (rad).
       xp: `numpy` or `jax.numpy`.
-      yaw: [..., K] by how much each sensor is turned to the left of its nominal yaw, rad; None: 0.
+      mount: how the sensors are mounted.
 
     Returns:
       Origins and unit directions, [..., K, 2] each, world frame.
     """
-    x, y, toward_x, toward_y = _cast(pose, xp, yaw)
+    x, y, toward_x, toward_y = _cast(pose, xp, mount)
     return xp.stack([x, y], axis=-1), xp.stack([toward_x, toward_y], axis=-1)
 
 
-def _cast(pose: Array, xp: Any, yaw: Array | None) -> Ray:
+def _cast(pose: Array, xp: Any, mount: Mount) -> Ray:
     """Places the rays [..., K] of robots [..., 3] in the world."""
     cos, sin = xp.cos(pose[..., 2])[..., None], xp.sin(pose[..., 2])[..., None]
-    x, y, bearing = SENSOR_POSES.T
+    x, y, bearing = np.array(mount.poses, np.float32).T
     # Angle-sum identities avoid a sine and a cosine per ray for sensors with the nominal yaw.
     ahead, aside = np.cos(bearing), np.sin(bearing)
-    if yaw is not None:
-        ahead, aside = xp.cos(bearing + yaw), xp.sin(bearing + yaw)
+    if mount.turn is not None:
+        yaw = bearing + mount.turn
+        ahead, aside = xp.cos(yaw), xp.sin(yaw)
     return Ray(
         x=pose[..., :1] + cos * x - sin * y,
         y=pose[..., 1:2] + sin * x + cos * y,
@@ -192,7 +208,7 @@ def distances(
     hull_radius: float,
     limit: float,
     xp: Any,
-    yaw: Array | None = None,
+    mount: Mount = EPUCK,
 ) -> Array:
     """Returns the exact distances that the infrared sensors of a swarm see.
 
@@ -204,12 +220,12 @@ def distances(
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
       xp: `numpy` or `jax.numpy`.
-      yaw: [..., R, K] as in `rays`.
+      mount: how the sensors are mounted.
 
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
     """
-    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, yaw, xp))
+    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, mount, xp))
     return xp.maximum(least(reaches, limit, xp), 0.0)
 
 
@@ -220,7 +236,7 @@ def sights(
     hull_radius: float,
     limit: float,
     reflectance: Reflectance,
-    yaw: Array | None,
+    mount: Mount,
     xp: Any,
 ) -> tuple[Array, Array]:
     """Returns what the infrared sensors of a swarm see: distances and reflectances.
@@ -232,7 +248,7 @@ def sights(
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
       reflectance: reflectances of surfaces.
-      yaw: [..., R, K] as in `rays`.
+      mount: how the sensors are mounted.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -241,7 +257,7 @@ def sights(
       takes precedence over a robot, and a robot over an obstacle. Among objects of one kind, the
       brightest takes precedence.
     """
-    wall, robot, box = _reaches(pose, side, obstacle, hull_radius, yaw, xp)
+    wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
     shades = reflectance.fixture
     walls, boxes = (None, None) if shades is None else (shades[..., :1], shades[..., 1:])
     things = ((wall, walls), (robot, reflectance.robot), (box, boxes))
@@ -266,10 +282,10 @@ def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) 
 
 
 def _reaches(
-    pose: Array, side: Array, obstacle: Array, hull_radius: float, yaw: Array | None, xp: Any
+    pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount, xp: Any
 ) -> tuple[list[Array], list[Array], list[Array]]:
     """Returns distances (m) to walls, other robots and obstacles, as pieces [..., R, K, N]."""
-    ray = _cast(pose, xp, yaw)
+    ray = _cast(pose, xp, mount)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
     ray = Ray(*(part[..., None] for part in ray))
     box, myself = turned(obstacle, xp), np.eye(pose.shape[-2], dtype=bool)

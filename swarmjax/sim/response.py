@@ -1,13 +1,13 @@
 """Infrared sensor models: convert ray lengths to counts, and back.
 
 A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. The real
-ray rises by `epuck.SENSOR_TILT`, so it is longer by 1 / cos(tilt) against an upright face.
+ray rises by `robot.sensor_tilt`, so it is longer by 1 / cos(tilt) against an upright face.
 
-`webots` is the lookup table of Webots' E-puck. The table maps (length of the ray) / reflectance to
-counts, with multiplicative noise. In free space, it reads 67.19 counts. `real` is a curve fitted to
-each sensor of a measured robot. The curve gives reflectance * A / (gap + d)^2 counts above free
-space, with additive noise. Readings in free space are set to zero, as by the firmware. The code
-runs on NumPy or JAX.
+`webots` is a lookup table; the default is that of Webots' E-puck. The table maps (length of the
+ray) / reflectance to counts, with multiplicative noise. In free space, the e-puck reads 67.19
+counts. `real` is a curve fitted to each sensor of a measured robot. The curve gives reflectance * A
+/ (gap + d)^2 counts above free space, with additive noise. Readings in free space are set to zero,
+as by the firmware. The code runs on NumPy or JAX.
 """
 
 import math
@@ -21,12 +21,39 @@ from swarmjax import epuck
 Array = Any
 Response = Literal["webots", "real"]
 
-_RISE = math.cos(epuck.SENSOR_TILT)
-_LENGTH, _COUNTS, _SHARE = zip(*epuck.INFRARED_TABLE, strict=True)
+
+class Table(NamedTuple):
+    """The response of sensors.
+
+    Attributes:
+      length: lengths of the ray, rising, m.
+      counts: value at each length, falling.
+      share: standard deviation at each length, relative to the value.
+      rise: horizontal part of a ray's length.
+    """
+
+    length: tuple[float, ...]
+    counts: tuple[float, ...]
+    share: tuple[float, ...]
+    rise: float
+
+    @property
+    def reach(self) -> float:
+        """Horizontal length of the longest ray, m."""
+        return self.length[-1] * self.rise
+
+
+def table(points: Sequence[Sequence[float]], tilt: float) -> Table:
+    """Makes a table from rows of `robot.sensor_response`, for rays that rise by `tilt` rad."""
+    length, counts, share = zip(*points, strict=True)
+    return Table(length, counts, share, math.cos(tilt))
+
+
+EPUCK = table(epuck.INFRARED_TABLE, epuck.SENSOR_TILT)
 # m; nothing is seen beyond this length, so rays end there. Webots' table ends at this length, for
 # objects of reflectance 1 at most. The measured curve would still read 13 to 22 counts there. The
 # longest range in any e-puck simulator is 0.10 to 0.12 m (ARGoS, Enki).
-REACH = {"webots": _LENGTH[-1] * _RISE, "real": 0.10}
+REACH = {"webots": EPUCK.reach, "real": 0.10}
 _STRENGTH, _DEPTH, _FREE, _SD, _SATURATION = np.array(epuck.INFRARED_FIT, np.float32).T
 _SPAN = _SATURATION - _FREE
 
@@ -63,6 +90,7 @@ def read(
     wear: Wear,
     normal: Array | None,
     xp: Any,
+    table: Table = EPUCK,
 ) -> Array:
     """Reads the sensors.
 
@@ -73,6 +101,7 @@ def read(
       wear: wear of the sensors.
       normal: [..., R, K] standard normal, drawn for each sample; None for no noise.
       xp: `numpy` or `jax.numpy`.
+      table: the response `webots`.
 
     Returns:
       [..., R, K] counts, not clamped: noise can take a `real` reading below 0.
@@ -82,7 +111,7 @@ def read(
     bright = 1.0 if reflectance is None else reflectance
     gain = 1.0 if wear.gain is None else wear.gain
     if response == "webots":
-        counts, sd = _webots(ray, bright, gain, xp)
+        counts, sd = _webots(ray, bright, gain, table, xp)
     else:
         counts, sd = _real(ray, bright, gain, xp)
     if wear.noise is None or normal is None:
@@ -90,41 +119,42 @@ def read(
     return counts + wear.noise * sd * normal
 
 
-def expected(response: Response, ray: Array, xp: Any) -> Array:
+def expected(response: Response, ray: Array, xp: Any, table: Table = EPUCK) -> Array:
     """Returns noise-free counts [..., R, K] of nominal sensors for rays [..., R, K] (m)."""
-    return read(response, ray, None, Wear(), None, xp)
+    return read(response, ray, None, Wear(), None, xp, table)
 
 
-def distance(response: Response, counts: Array, xp: Any) -> Array:
+def distance(response: Response, counts: Array, xp: Any, table: Table = EPUCK) -> Array:
     """Returns the ray that a nominal sensor's counts correspond to: the inverse of `expected`.
 
     Args:
       response: sensor model.
       counts: [..., R, K].
       xp: `numpy` or `jax.numpy`.
+      table: the response `webots`.
 
     Returns:
-      [..., R, K] m, falling as counts rise, 0..`REACH[response]`. A saturated `real` sensor gives
-      the largest distance at which it saturates.
+      [..., R, K] m, falling as counts rise, from 0 to the reach of the response. A saturated
+      `real` sensor gives the largest distance at which it saturates.
     """
-    reach = REACH[response]
     if response == "webots":
-        return xp.clip(_RISE * _interpolate(counts, _COUNTS[::-1], _LENGTH[::-1], xp), 0.0, reach)
+        length = _interpolate(counts, table.counts[::-1], table.length[::-1], xp)
+        return xp.clip(table.rise * length, 0.0, table.reach)
     # Any lower limit works if it is below the reading at the largest distance.
     echo = xp.clip(counts, 1.0, _SPAN)
-    return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, reach)
+    return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, REACH[response])
 
 
-def _webots(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
-    """Returns counts and their standard deviation, from the table of Webots' E-puck.
+def _webots(ray: Array, bright: Array, gain: Array, table: Table, xp: Any) -> tuple[Array, Array]:
+    """Returns counts and their standard deviation, from a table.
 
     Webots divides the length by the reflectance before the lookup, and multiplies the counts by
     1 + share * normal (DistanceSensor, section "Sensor noise").
     """
-    length = ray / (_RISE * bright)
-    above = [counts - _COUNTS[-1] for counts in _COUNTS]
-    counts = _COUNTS[-1] + gain * _interpolate(length, _LENGTH, above, xp)
-    return counts, counts * _interpolate(length, _LENGTH, _SHARE, xp)
+    length, free = ray / (table.rise * bright), table.counts[-1]
+    above = [counts - free for counts in table.counts]
+    counts = free + gain * _interpolate(length, table.length, above, xp)
+    return counts, counts * _interpolate(length, table.length, table.share, xp)
 
 
 def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:

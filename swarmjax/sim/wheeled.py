@@ -1,4 +1,4 @@
-"""The wheeled body: the whole e-puck, free in space, on two driven wheels and two skids.
+"""The wheeled body: a whole robot, free in space, on two driven wheels and two skids.
 
 The motors are steppers behind a 50:1 gear. A command sets the speed of a wheel, and no load changes
 it until steps are lost. (Webots gives its motors 10 N m, which has the same effect.) Here the motor
@@ -32,10 +32,10 @@ _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
 REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; 9e-6 with steps of 16 ms
 _PENETRATION = 0.5  # share of the penetration that one physics step removes
 _IMPEDANCE = 0.999  # impedance of the grip; the grip cancels all but a thousandth of gravity
-# m; y of a wheel's frame. The tyre is 5 mm wide, so its geom lies off this frame. If a geom is
-# compiled at the origin of its body's frame, MuJoCo treats it as fixed there, whatever `geom_pos`
-# is.
-_INNER_EDGE = epuck.AXLE_Y - 0.0025
+# m; from the middle of a tyre to the wheel's frame. The e-puck's tyre is 5 mm wide, so its geom
+# lies off this frame. If a geom is compiled at the origin of its body's frame, MuJoCo treats it as
+# fixed there, whatever `geom_pos` is.
+_TO_INNER_EDGE = 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
 
 
@@ -48,7 +48,8 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     for label, side in (("left", 1.0), ("right", -1.0)):
         _add_wheel(spec, body, f"{name}_{label}", side, robot, timestep)
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-    for label, x in (("front", epuck.SKID_X), ("back", -epuck.SKID_X)):
+    skid_x = epuck.SKID_X * (robot.hull_radius / epuck.HULL_RADIUS)
+    for label, x in (("front", skid_x), ("back", -skid_x)):
         place = [x, 0.0, SKID_RADIUS + epuck.SKID_CLEARANCE]
         skid = add_geom(body, f"{name}_{label}", sphere, [SKID_RADIUS, 0, 0], place, FLOOR_GROUP)
         # With condim 1, skids carry weight but do not brake, as is intended for the smooth box of
@@ -66,8 +67,8 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 def _set_inertia(body: mujoco.MjsBody, robot: RobotConfig) -> None:
     """Gives the body the mass and inertia of the robot without its wheels."""
-    wheel = epuck.WHEEL_MASS
-    yaw = robot.yaw_inertia - 2.0 * (wheel * epuck.AXLE_Y**2 + epuck.WHEEL_INERTIA[0])
+    wheel, axle = robot.wheel_mass, 0.5 * robot.track
+    yaw = robot.yaw_inertia - 2.0 * (wheel * axle**2 + robot.wheel_inertia[0])
     body.explicitinertial = True
     body.mass = robot.mass - 2.0 * wheel
     body.ipos = [0.0, 0.0, epuck.COM_HEIGHT]
@@ -88,21 +89,27 @@ def _add_wheel(
     rolls like a wheel of the same radius. The distance between the contact points of both wheels is
     constant.
     """
-    wheel = body.add_body(name=name, pos=[0.0, side * _INNER_EDGE, robot.wheel_radius])
+    inner_edge = _inner_edge(robot)
+    wheel = body.add_body(name=name, pos=[0.0, side * inner_edge, robot.wheel_radius])
     wheel.explicitinertial = True
-    wheel.mass = epuck.WHEEL_MASS
-    wheel.ipos = [0.0, side * (epuck.AXLE_Y - _INNER_EDGE), 0.0]
-    wheel.inertia = epuck.WHEEL_INERTIA
+    wheel.mass = robot.wheel_mass
+    wheel.ipos = [0.0, side * (0.5 * robot.track - inner_edge), 0.0]
+    wheel.inertia = robot.wheel_inertia
     hinge = mujoco.mjtJoint.mjJNT_HINGE
     wheel.add_joint(name=name, type=hinge, axis=[0, 1, 0], armature=ROTOR_INERTIA)
-    place = [0.0, side * (0.5 * robot.grip_track - _INNER_EDGE), 0.0]
+    place = [0.0, side * (0.5 * robot.grip_track - inner_edge), 0.0]
     sphere = mujoco.mjtGeom.mjGEOM_SPHERE
     add_geom(wheel, name, sphere, [robot.wheel_radius, 0, 0], place, FLOOR_GROUP)
     friction = [robot.friction, robot.friction, *SPIN]
     spec.add_pair(geomname1=FLOOR, geomname2=name, condim=3, friction=friction, **_grip(timestep))
     motor = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-    inertia = ROTOR_INERTIA + epuck.WHEEL_INERTIA[1]
+    inertia = ROTOR_INERTIA + robot.wheel_inertia[1]
     motor.set_to_velocity(servo_share(robot.motor_lag, timestep) * inertia / timestep)
+
+
+def _inner_edge(robot: RobotConfig) -> float:
+    """Returns the distance of a wheel's frame from the middle of the robot, m."""
+    return 0.5 * robot.track - _TO_INNER_EDGE
 
 
 def _grip(timestep: float) -> dict[str, list[float]]:
@@ -160,7 +167,7 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
         changes["geom_size"] = ((rows.wheel_geoms, 0), chassis.wheel_radius)
         changes["body_pos"] = ((rows.wheel_bodies, 2), chassis.wheel_radius)
     if chassis.track is not None:
-        beyond = 0.5 * chassis.track[:, None] - _INNER_EDGE
+        beyond = 0.5 * chassis.track[:, None] - _inner_edge(robot)
         changes["geom_pos"] = ((rows.wheel_geoms, 1), beyond * _SIDES)
     return changes
 

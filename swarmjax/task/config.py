@@ -44,7 +44,7 @@ class RewardConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskConfig(Section):
-    """What a robot is asked to do, and what it senses."""
+    """What a robot is asked to do, and what it observes."""
 
     control_step: float = setting(0.032, "control step, s; Webots basicTimeStep", 0.001, 0.2)
     step_limit: int = setting(500, "control steps of a training episode", 1, MAX_COUNT)
@@ -59,7 +59,6 @@ class TaskConfig(Section):
         "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
         "and the episode is complete when all are within their targets at once",
     )
-    sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
     encoding: Literal["auto", "metric", "webots"] = setting(
         "auto",
         "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
@@ -73,10 +72,12 @@ class TaskConfig(Section):
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:
     """Returns part of a sentence that describes the robot, its sensors and the task."""
+    own = robot.sensor_poses != epuck.SENSOR_POSES
+    sensors = f" of {len(robot.sensor_poses)} sensors" if own else ""
     rubs = f" of friction {robot.hull_friction:g}" if robot.hull_friction else ""
     return (
-        f"hull {robot.hull_radius:g} m{rubs}, infrared to {task.sensor_range:g} m, at most "
-        f"{robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
+        f"hull {robot.hull_radius:g} m{rubs}, infrared{sensors} to {robot.sensor_range:g} m, at "
+        f"most {robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
         f"{task.control_step:g} s, arrival {task.arrival}, realism "
         f"{inherit.preset_of('realism', realism)}"
     )
@@ -94,6 +95,12 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
     Raises:
       ConfigError: a setting is too large; the message names the full key.
     """
+    if realism.infrared == "real" and robot.sensor_poses != epuck.SENSOR_POSES:
+        raise ConfigError(
+            "realism.infrared is real, which repeats the measured sensors of the e-puck, but "
+            "robot.sensor_poses are others: give realism.infrared=webots, with "
+            "robot.sensor_response, or realism.infrared=ideal."
+        )
     hull, seconds = robot.hull_radius, steps * task.control_step
     for key, value, most in (
         ("track", realism.track, 2 * hull),

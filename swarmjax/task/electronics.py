@@ -14,6 +14,7 @@ from swarmjax.extension import Observation
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import infrared, motor, noise, response
 from swarmjax.sim.body import Chassis
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.drive import Drive
 from swarmjax.sim.noise import Stream
 from swarmjax.sim.realism_config import RealismConfig
@@ -24,6 +25,7 @@ from swarmjax.task.level import Level
 from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
+EPUCK = RobotConfig()
 _SLACK = 1e-4  # share of a period, so that rounding does not delay a sample that is due now
 
 
@@ -34,27 +36,33 @@ class Electronics:
     Attributes:
       realism: which factors are on.
       encoding: how observations are encoded.
-      sensor_range: largest infrared distance that is observed, m.
+      robot: the robot; its sensors are read.
       control_step: s.
       own: observations of an extension, placed after the built-in ones.
     """
 
     realism: RealismConfig
     encoding: Encoding
-    sensor_range: float
+    robot: RobotConfig
     control_step: float
     own: tuple[Observation, ...] = ()
 
     @cached_property
     def layout(self) -> Layout:
         """Names, units and scales of the observation's entries."""
-        return observation.layout(self.encoding, self.own)
+        return observation.layout(self.encoding, self.own, len(self.robot.sensor_poses))
+
+    @cached_property
+    def table(self) -> response.Table:
+        """Response of the sensors with `realism.infrared=webots`."""
+        return response.table(self.robot.sensor_response, self.robot.sensor_tilt)
 
     @property
     def reach(self) -> float:
         """Largest distance to which rays are cast, m."""
-        curves = {self.realism.infrared, self.encoding}
-        return max([self.sensor_range, *(response.REACH.get(name, 0.0) for name in curves)])
+        curves, known = {self.realism.infrared, self.encoding}, dict(response.REACH)
+        known["webots"] = self.table.reach
+        return max([self.robot.sensor_range, *(known.get(name, 0.0) for name in curves)])
 
 
 class Memory(NamedTuple):
@@ -122,6 +130,7 @@ def load(
     realism: RealismConfig,
     encoding: Encoding | None = None,
     own: Sequence[Observation] = (),
+    robot: RobotConfig = EPUCK,
 ) -> Electronics:
     """Creates the electronics from the settings.
 
@@ -130,6 +139,7 @@ def load(
       realism: the factors.
       encoding: encoding that the policy was trained with; None for the encoding of the task.
       own: observations of an extension.
+      robot: the robot.
 
     Returns:
       The electronics.
@@ -137,7 +147,7 @@ def load(
     return Electronics(
         realism=realism,
         encoding=resolve_encoding(task, realism) if encoding is None else encoding,
-        sensor_range=task.sensor_range,
+        robot=robot,
         control_step=task.control_step,
         own=tuple(own),
     )
@@ -285,18 +295,23 @@ def _read_infrared(
         if factors.dead_sensor is not None:
             ray = xp.where(factors.dead_sensor, electronics.reach, ray)
     else:
-        counts = _read_counts(kind, factors, sight, clock, xp)
+        counts = _read_counts(kind, electronics, factors, sight, clock, xp)
         if kind == encoding:
             return counts
         # A calibrated robot converts counts back to a distance.
-        ray = response.distance(kind, counts, xp)
+        ray = response.distance(kind, counts, xp, electronics.table)
     if encoding == "webots":
-        return response.expected("webots", ray, xp)
-    return xp.minimum(ray, electronics.sensor_range)
+        return response.expected("webots", ray, xp, electronics.table)
+    return xp.minimum(ray, electronics.robot.sensor_range)
 
 
 def _read_counts(
-    kind: response.Response, factors: Factors, sight: Sight, clock: Array, xp: Any
+    kind: response.Response,
+    electronics: Electronics,
+    factors: Factors,
+    sight: Sight,
+    clock: Array,
+    xp: Any,
 ) -> Array:
     """Samples the counts of sensors with the response `kind`, [..., R, K]."""
     wear = response.Wear(factors.infrared_noise, factors.infrared_gain, factors.dead_sensor)
@@ -304,7 +319,7 @@ def _read_counts(
     if factors.infrared_noise is not None:
         shape = sight.ray.shape[-2:]
         normal = noise.normal(factors.seed, clock, Stream.INFRARED, shape, xp)
-    return response.read(kind, sight.ray, sight.reflectance, wear, normal, xp)
+    return response.read(kind, sight.ray, sight.reflectance, wear, normal, xp, electronics.table)
 
 
 def _find_target(

@@ -163,7 +163,7 @@ def load(
             "in JAX_ENABLE_X64=0."
         )
     chosen = pieces.choose(extensions, task, stages)
-    extended.check(chosen, robots=sim.robots, obstacles=sim.obstacles)
+    extended.check(chosen, robot, robots=sim.robots, obstacles=sim.obstacles)
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
     room.check(stages, spacing, chosen.drawings)
@@ -174,7 +174,7 @@ def load(
         physics=_load_physics(size, robot, task, realism, sim, arenas),
         spacing=spacing,
         drive=sim_drive.from_config(robot),
-        electronics=task_electronics.load(task, realism, own=chosen.observations),
+        electronics=task_electronics.load(task, realism, own=chosen.observations, robot=robot),
         terms=chosen.terms,
         drawings=chosen.drawings,
     )
@@ -210,7 +210,8 @@ def reset(world: World, level: Level) -> EnvState:
       The state, with `sim` as a `PhysicsState`.
     """
     robots, obstacles = level.present.shape[0], level.obstacle_present.shape[0]
-    factors = task_factors.draw(level.seed, world.realism, robots, obstacles, jnp)
+    sensors = len(world.robot.sensor_poses)
+    factors = task_factors.draw(level.seed, world.realism, robots, obstacles, jnp, sensors)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
@@ -339,7 +340,7 @@ def _reward_step(
         distance_before=before.distance,
         distance=after.distance,
         infrared=sight.ray,
-        sensor_range=world.task.sensor_range,
+        sensor_range=world.robot.sensor_range,
         arrives=arrives,
         contact_begins=begins,
         touching=after.apart == 0.0,
@@ -389,12 +390,13 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     """Computes the sensor quantities at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
-    yaw, shades = factors.infrared_yaw, task_electronics.reflectance(factors)
+    mount = infrared.Mount(world.robot.sensor_poses, factors.infrared_yaw)
+    shades = task_electronics.reflectance(factors)
     arena = (pose, level.side, level.obstacle, radius, reach)
     if shades is None:
-        ray, bright = infrared.distances(*arena, jnp, yaw), None
+        ray, bright = infrared.distances(*arena, jnp, mount), None
     else:
-        ray, bright = infrared.sights(*arena, shades, yaw, jnp)
+        ray, bright = infrared.sights(*arena, shades, mount, jnp)
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))

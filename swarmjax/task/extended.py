@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax import epuck
 from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import LevelDrawing, Observation, Piece
+from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import electronics, level
 from swarmjax.task.electronics import Sight
@@ -90,11 +90,12 @@ def _compiled(piece: LevelDrawing) -> Callable[[Level], Level]:
     return jax.jit(lambda drawn: piece.function(drawn, jax.random.key(drawn.seed)))
 
 
-def check(chosen: Chosen, robots: int, obstacles: int) -> None:
+def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> None:
     """Refuses pieces that return a wrong shape or type; compiles nothing.
 
     Args:
       chosen: the pieces.
+      robot: the robot.
       robots: R.
       obstacles: M.
 
@@ -106,13 +107,14 @@ def check(chosen: Chosen, robots: int, obstacles: int) -> None:
         _shape(robots, dtype=bool),
         _shape(dtype=jnp.int32),
     )
-    sight = Sight(_shape(robots, epuck.SENSORS), None, _shape(robots), _shape(robots))
+    infrared = _shape(robots, len(robot.sensor_poses))
+    sight = Sight(infrared, None, _shape(robots), _shape(robots))
     seen = electronics.view(sight, drawn.start, drawn, there, whole)
     for piece in chosen.observations:
         shapes = [(robots, piece.size)] + ([(robots,)] if piece.size == 1 else [])
         _check_floats(piece, shapes, seen)
     for piece, _ in chosen.terms:
-        _check_floats(piece, [(robots,)], _step(robots))
+        _check_floats(piece, [(robots,)], _step(infrared, robot.sensor_range))
     for piece in chosen.drawings:
         _check_drawing(piece, drawn)
 
@@ -162,14 +164,15 @@ def _shape(*shape: int, dtype: Any = jnp.float32) -> Any:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
-def _step(robots: int) -> Step:
+def _step(infrared: Any, sensor_range: float) -> Step:
+    robots = infrared.shape[0]
     there, kinds = _shape(robots, dtype=bool), _shape(robots, len(KINDS), dtype=bool)
     distance, pose = _shape(robots), _shape(robots, 3)
     return Step(
         distance_before=distance,
         distance=distance,
-        infrared=_shape(robots, epuck.SENSORS),
-        sensor_range=epuck.SENSOR_RANGE,
+        infrared=infrared,
+        sensor_range=sensor_range,
         arrives=there,
         contact_begins=kinds,
         touching=kinds,

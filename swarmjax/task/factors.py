@@ -99,7 +99,14 @@ _DRAWN = {
 }
 
 
-def draw(seed: Array, realism: RealismConfig, robots: int, obstacles: int, xp: Any) -> Factors:
+def draw(
+    seed: Array,
+    realism: RealismConfig,
+    robots: int,
+    obstacles: int,
+    xp: Any,
+    sensors: int = epuck.SENSORS,
+) -> Factors:
     """Draws the factors of an episode.
 
     Each factor has its own random numbers, so switching one off leaves the others unchanged.
@@ -123,11 +130,12 @@ def draw(seed: Array, realism: RealismConfig, robots: int, obstacles: int, xp: A
       robots: largest number of robots, R.
       obstacles: largest number of obstacles, M.
       xp: `numpy` or `jax.numpy`; both draw the same.
+      sensors: infrared sensors of a robot, K.
 
     Returns:
       The factors, with the leading axes of `seed`.
     """
-    seed, sizes = xp.asarray(seed, xp.uint32), {"R": robots, "K": epuck.SENSORS, "F": 1 + obstacles}
+    seed, sizes = xp.asarray(seed, xp.uint32), {"R": robots, "K": sensors, "F": 1 + obstacles}
     found: dict[str, Array] = {}
     for name, (function, axes) in _DRAWN.items():
         setting = getattr(realism, name)
@@ -150,7 +158,7 @@ def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius that no draw exceeds.
+      The robot, with a wheel radius that no draw exceeds; its speeds are not for driving.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
-    return replace(robot, wheel_radius=most)
+    return replace(robot, wheel_radius=most, wheel_limit="clip")

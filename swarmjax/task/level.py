@@ -33,7 +33,7 @@ from swarmjax.task.placement import (
     units,
 )
 from swarmjax.task.stage import Stage
-from swarmjax.task.stage_config import PASSAGE
+from swarmjax.task.stage_config import passage
 
 Array = Any
 
@@ -102,7 +102,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Draws a level of a stage.
 
     A random level places obstacles, then targets, then starts, without overlap. Obstacles keep
-    `PASSAGE` clear between each other and to the walls. An obstacle that finds no such place is
+    a `passage` clear between each other and to the walls. An obstacle that finds no such place is
     left out. Where the arena has room, targets keep their distance from each other and from
     obstacles, so that a robot can pass between any two arrived robots. Every target then stays
     reachable, whatever the order of arrival.
@@ -148,7 +148,7 @@ def _random(drawn: _Uniforms, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     length = _side(stage, seed, xp)
     side = units(length, xp)
     present = xp.arange(spacing.robots) < stage.robots
-    centre, there, radius = _place_obstacles(drawn, stage, side, xp)
+    centre, there, radius = _place_obstacles(drawn, stage, side, spacing, xp)
     hull, reach = spacing.hull_radius, spacing.target_radius
     apart, from_target, start_apart = gaps_of(hull, reach)
     clear = clearance(hull)
@@ -200,7 +200,7 @@ def _side(stage: Stage, seed: Array, xp: Any) -> Array:
 
 
 def _place_obstacles(
-    drawn: _Uniforms, stage: Stage, side: Array, xp: Any
+    drawn: _Uniforms, stage: Stage, side: Array, spacing: Spacing, xp: Any
 ) -> tuple[Array, Array, Array]:
     """Places randomly turned boxes, with a passage between all of their outer circles.
 
@@ -208,9 +208,10 @@ def _place_obstacles(
       Centres [M, 2] (units), presence [M], and the outer radius [] (units).
     """
     radius = units(stage.obstacle_size * np.float32(math.sqrt(0.5)), xp) + 1
-    gap = 2 * radius + round_up(PASSAGE)
+    free = round_up(passage(spacing.hull_radius))
+    gap = 2 * radius + free
     points = lattice(drawn.obstacle_shift, side, xp)
-    score = score_walls(points, side, radius + round_up(PASSAGE), xp)
+    score = score_walls(points, side, radius + free, xp)
     there = xp.arange(drawn.obstacle.shape[0]) < stage.obstacles
     centre, there = place(points, score, drawn.obstacle, there, Gap(gap, gap), xp)
     return centre, there, radius

@@ -17,7 +17,6 @@ from swarmjax.extension import Observation
 
 Array = Any
 Encoding = Literal["metric", "webots"]
-SENSORS = epuck.SENSORS
 
 
 class Readings(NamedTuple):
@@ -64,7 +63,7 @@ class Input(NamedTuple):
 # pi), so a scaled bearing of 0.5 is dead ahead.
 INPUTS = (
     Input(
-        tuple(f"infrared_{i}" for i in range(SENSORS)),
+        ("infrared",),  # one entry for each sensor
         lambda readings: readings.infrared,
         {"metric": Coding("m"), "webots": Coding("counts", scale=1023.0)},
     ),
@@ -102,17 +101,27 @@ class Layout(NamedTuple):
         return len(self.names)
 
 
-def layout(encoding: Encoding, own: Sequence[Observation] = ()) -> Layout:
+def names(sensors: int) -> list[tuple[str, Input]]:
+    """Returns the names of the built-in entries, for a number of infrared sensors."""
+    infrared, *others = INPUTS
+    found = [(f"infrared_{i}", infrared) for i in range(sensors)]
+    return found + [(name, each) for each in others for name in each.names]
+
+
+def layout(
+    encoding: Encoding, own: Sequence[Observation] = (), sensors: int = epuck.SENSORS
+) -> Layout:
     """Lays out an observation: built-in inputs, then observations of an extension.
 
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension, in order.
+      sensors: number of infrared sensors, K.
 
     Returns:
       The layout.
     """
-    rows = [(name, *each.codings[encoding]) for each in INPUTS for name in each.names]
+    rows = [(name, *each.codings[encoding]) for name, each in names(sensors)]
     rows += [(name, each.unit, each.offset, each.scale) for each in own for name in each.names]
     return Layout(*zip(*rows, strict=True))
 
@@ -122,17 +131,20 @@ NAMES = LAYOUTS["metric"].names
 SIZE = LAYOUTS["metric"].size
 
 
-def describe(encoding: Encoding, own: Sequence[Observation] = ()) -> dict[str, Any]:
+def describe(
+    encoding: Encoding, own: Sequence[Observation] = (), sensors: int = epuck.SENSORS
+) -> dict[str, Any]:
     """Describes the observation of a policy as plain data for its file.
 
     Args:
       encoding: encoding of the built-in quantities.
       own: observations of an extension.
+      sensors: number of infrared sensors, K.
 
     Returns:
       `names`, `encoding`, and the layout's `units`, `offset` and `scale`.
     """
-    parts = layout(encoding, own)._asdict()
+    parts = layout(encoding, own, sensors)._asdict()
     return {"encoding": encoding, **{key: list(values) for key, values in parts.items()}}
 
 

@@ -1,10 +1,12 @@
 """Checks that maps, layouts and an extension's level drawings place robots where they fit."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from swarmjax import epuck
 from swarmjax.config import ConfigError, show
 from swarmjax.extension import LevelDrawing
 from swarmjax.sim import gaps
@@ -12,7 +14,7 @@ from swarmjax.task import level, ways
 from swarmjax.task import stage as task_stage
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.placement import MARGIN, round_up
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import StageConfig, smallest_side
 
 _TRIED = 16  # levels of a stage to check
 _THINGS: dict[str, str] = dict(
@@ -26,7 +28,7 @@ def check(
     """Refuses stages in which robots or targets would overlap, or lie outside the walls.
 
     Args:
-      stages: stages to run. Random and fixed levels always fit.
+      stages: stages to run. Random and fixed levels fit all hulls up to the e-puck's.
       spacing: sizes.
       drawings: level drawings of an extension.
 
@@ -38,12 +40,35 @@ def check(
         if own is not None:
             for drawn in _levels(stage, spacing, drawings):
                 _check_own(own, stage, drawn, spacing)
-        elif stage.map or stage.kind is not None:
+        elif must_check(stage, spacing.hull_radius):
             # A level in which no starts have the way and room keeps those that are checked here.
             for drawn in _levels(replace(stage, distance=None), spacing):
                 check_level(stage, drawn, spacing)
         if stage.distance is not None:
             _check_distance(stage, spacing, drawings)
+
+
+def must_check(stage: StageConfig, hull: float) -> bool:
+    """Returns whether the levels of a stage might lack room for hulls of this radius.
+
+    Raises:
+      ConfigError: the stage is too small for such hulls, whatever is drawn.
+    """
+    if stage.gap is not None and np.min(stage.gap) < 2 * hull:
+        raise ConfigError(
+            f"stage {stage.name}: gap is {show(stage.gap)}, but robot.hull_radius is {show(hull)} "
+            f"and no such robot fits through: give more than {show(2 * hull)}."
+        )
+    if stage.map or stage.kind is not None:
+        return True
+    least = smallest_side(stage, hull) if stage.level == "random" else 0.0
+    if stage.sides[0] < least and hull > epuck.HULL_RADIUS:
+        raise ConfigError(
+            f"stage {stage.name}: side is {show(stage.side)}, too small for {stage.robots} robots "
+            f"and {stage.obstacles} obstacles with robot.hull_radius={show(hull)}: give at least "
+            f"{math.ceil(100 * least) / 100}."
+        )
+    return hull > epuck.HULL_RADIUS and stage.level in ("random", "fixed")
 
 
 def _levels(
@@ -57,7 +82,7 @@ def _levels(
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level of a map or a layout that has no room for its robots; without JAX."""
+    """Refuses a level that has no room for its robots; without JAX."""
     arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
     problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
     if not problem and (arrived & drawn.present).any():

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, section, setting, show
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import fixed_level, maps
@@ -19,9 +20,10 @@ from swarmjax.task.placement import UNITS
 # Area that a random level needs. A start and a target each take a square of 0.15 m (two hulls of
 # 0.074 m side by side). An obstacle takes the square around its circumscribed circle, widened by a
 # passage. In a passage, one robot has 13 mm to spare on either side. Along the walls, a border of
-# half a passage stays free.
+# half a passage stays free. For hulls larger than the e-puck's, both lengths grow with the hull.
 DISC = 0.15  # m, edge of the square around the disc of a start or a target
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
+_DISC_PER_HULL, _PASSAGE_PER_HULL = 4.05, 2.7  # lengths per hull radius; as for the e-puck
 FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
@@ -235,7 +237,12 @@ class StageConfig(Section):
         return _ends(self.side)
 
 
-def smallest_side(stage: StageConfig) -> float:
+def passage(hull: float) -> float:
+    """Returns the passage between obstacles that robots of this hull radius get, m."""
+    return max(PASSAGE, _PASSAGE_PER_HULL * hull)
+
+
+def smallest_side(stage: StageConfig, hull: float = epuck.HULL_RADIUS) -> float:
     """Returns the smallest side of an arena that has room for a level of the stage.
 
     The free square (side - 0.10)^2 must hold two squares of 0.15^2 for each robot. It must also
@@ -248,15 +255,17 @@ def smallest_side(stage: StageConfig) -> float:
 
     Args:
       stage: the stage; its `side` is not read.
+      hull: radius of the robots, m. The numbers above are those of hulls up to the e-puck's.
 
     Returns:
       The side, m.
     """
-    pitch = stage.obstacle_size * math.sqrt(2) + PASSAGE
-    area = stage.robots * 2 * DISC**2 + stage.obstacles * pitch**2
+    free, disc = passage(hull), max(DISC, _DISC_PER_HULL * hull)
+    pitch = stage.obstacle_size * math.sqrt(2) + free
+    area = stage.robots * 2 * disc**2 + stage.obstacles * pitch**2
     if stage.level != "fixed":  # an extension's drawing starts from a random level
         area = max(area, stage.obstacles * pitch**2 / FILLING)
-    return PASSAGE + math.sqrt(area)
+    return free + math.sqrt(area)
 
 
 def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:

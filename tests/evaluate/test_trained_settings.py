@@ -14,7 +14,7 @@ from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
 from swarmjax.sim.realism_config import RealismConfig
 
-ODD = ["stage=s3", "robot.hull_radius=0.044", "task.sensor_range=0.1", "task.control_step=0.016"]
+ODD = ["stage=s3", "robot.hull_radius=0.044", "robot.sensor_range=0.1", "task.control_step=0.016"]
 
 
 def _policy(path: Path, *words: str) -> str:
@@ -36,7 +36,7 @@ def odd(tmp_path: Path) -> str:
 def test_hull_sensors_task_realism_and_stage_are_those_of_training(odd: str) -> None:
     found = _load(odd)
     assert (found.robot.hull_radius, found.stage.name) == (0.044, "s3")
-    assert (found.task.sensor_range, found.task.control_step) == (0.1, 0.016)
+    assert (found.robot.sensor_range, found.task.control_step) == (0.1, 0.016)
     real = build(RealismConfig, files.read_choice("realism", "real"))
     assert found.realism == replace(real, mass=None)
 
@@ -65,8 +65,8 @@ def test_the_body_is_on_wheels_unless_it_is_told(odd: str) -> None:
 
 
 def test_what_is_typed_wins(odd: str) -> None:
-    found = _load(odd, "robot.hull_radius=0.04", "task.sensor_range=0.05", "stage=s1")
-    assert (found.robot.hull_radius, found.task.sensor_range) == (0.04, 0.05)
+    found = _load(odd, "robot.hull_radius=0.04", "robot.sensor_range=0.05", "stage=s1")
+    assert (found.robot.hull_radius, found.robot.sensor_range) == (0.04, 0.05)
     assert (found.stage.name, found.task.control_step) == ("s1", 0.016)
 
 
@@ -95,9 +95,9 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
 
 
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
-    said = trained_settings.load(EvaluateConfig, [odd, "task.sensor_range=0.05"])[1]
+    said = trained_settings.load(EvaluateConfig, [odd, "robot.sensor_range=0.05"])[1]
     assert said.startswith(
-        "as trained but for task.sensor_range=0.05: hull 0.044 m of friction 1, infrared to "
+        "as trained but for robot.sensor_range=0.05: hull 0.044 m of friction 1, infrared to "
     )
     assert said.endswith(
         "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3"

@@ -88,7 +88,10 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
         ["stage=s1", "robot=wheeled_v2", "realism=real", "task.control_step=0.064", "seed=4"]
     )
     said = policy_meta(trained, update=7, seed=4)
-    assert said["robot"] == {"preset": "wheeled_v2"} | to_dict(trained.robot)
+    robot = to_dict(trained.robot)
+    sensors = {key: robot.pop(key) for key in [*robot] if key.startswith("sensor_")}
+    assert said["robot"] == {"preset": "wheeled_v2"} | robot
+    assert said["sensors"]["table"] == sensors["sensor_response"]
     assert (said["robot"]["hull_radius"], said["robot"]["max_wheel_speed"]) == (0.037, 7.536)
     sensors = said["sensors"]
     assert (sensors["preset"], sensors["response"], sensors["range"]) == ("real", "real", 0.04)

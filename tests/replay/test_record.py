@@ -69,7 +69,7 @@ def test_a_recording_is_what_the_judge_saw(steer):
             recording.scene.box, level.obstacle[level.obstacle_present].astype(float)
         )
     # Each episode has its own sensor directions, and the recording holds them.
-    _, nominal = infrared.rays(np.zeros(3), np, None)
+    _, nominal = infrared.rays(np.zeros(3), np)
     off = found[0].scene.sensor[..., 2:] - nominal
     assert 0.0 < np.abs(off).max() < 0.2  # rad; 5 deviations of 2 degrees
     assert not np.array_equal(found[0].scene.sensor, found[1].scene.sensor)

@@ -21,7 +21,7 @@ TINY = [
 ]
 PAPER = ["algo=paper", "stage=paper1", "algo.rollout_length=8", "algo.epochs=1", "arenas=1"]
 KINDS = {
-    "hull": [*TINY, "stage=s1", "robot.hull_radius=0.044", "task.sensor_range=0.1"],
+    "hull": [*TINY, "stage=s1", "robot.hull_radius=0.044", "robot.sensor_range=0.1"],
     "curriculum": [*TINY, "stage.sequence=[s1,s2]"],
     "seeds": [*TINY, "stage=s1", "seeds=2", "seed=3"],
     "paper": [*PAPER, "task.step_limit=8", "run.tensorboard=false"],

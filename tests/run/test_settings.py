@@ -184,8 +184,11 @@ def test_import_needs_neither_jax_nor_hydra():
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
         (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
+        (["robot.max_speed=0.3"], "robot.max_speed is 0.3, but wheels of 0.02 m at 6.28 rad/s "
+         "reach 0.1256 m/s: give at most that, or wheel_limit=clip, with which the robot drives "
+         "no faster."),
         (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
-         "0.045."),
+         "0.15."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),

@@ -367,11 +367,11 @@ def test_keys_that_do_not_fit_together_are_refused(
 
 
 def test_robot_task_realism_and_network_are_those_of_the_source(tmp_path: Path) -> None:
-    words = [*TINY, "robot.hull_radius=0.04", "task.sensor_range=0.06", "realism=webots"]
+    words = [*TINY, "robot.hull_radius=0.04", "robot.sensor_range=0.06", "realism=webots"]
     stored = to_dict(load_train([*words, "algo.hidden_sizes=[16]", "algo.activation=relu"]))
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    found = load_train([f"init_from={tmp_path}", "stage=s1", "task.sensor_range=0.05"])
-    assert (found.robot.hull_radius, found.task.sensor_range) == (0.04, 0.05)
+    found = load_train([f"init_from={tmp_path}", "stage=s1", "robot.sensor_range=0.05"])
+    assert (found.robot.hull_radius, found.robot.sensor_range) == (0.04, 0.05)
     assert (found.realism.infrared, found.algo.activation) == ("webots", "relu")
     assert found.algo.hidden_sizes == (16,)
     assert found.algo.rollout_length == load_train([]).algo.rollout_length

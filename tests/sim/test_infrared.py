@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from swarmjax import epuck
 from swarmjax.evaluate import engine_c
 from swarmjax.evaluate import rays as evaluate_rays
 from swarmjax.evaluate.config import EvaluateConfig
@@ -18,10 +19,13 @@ from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
 from swarmjax.sim.config import RobotConfig
+from swarmjax.sim.infrared import Mount
+from swarmjax.sim.sensors import Pose
 from swarmjax.task import observation
 from swarmjax.task.stage_config import StageConfig
 
 RANGE = 0.04  # m
+Poses = tuple[Pose, ...]
 RADIUS = 0.037  # m
 HALF_ROOT = math.sqrt(0.5)
 # One text computes both. JAX compiles each shape anew, so only the comparisons below take it.
@@ -158,7 +162,7 @@ def test_a_crooked_sensor_looks_where_it_is_turned(xp: ModuleType) -> None:
     pose = xp.array(_f32([0.1, 0.2, math.pi / 2], [-0.3, 0.0, math.pi / 2]))
     yaw = np.zeros((2, 8), np.float32)
     yaw[1, 2] = math.pi / 6
-    origin, direction = infrared.rays(pose, xp, xp.array(yaw))
+    origin, direction = infrared.rays(pose, xp, Mount(turn=xp.array(yaw)))
     straight = infrared.rays(pose, xp)
     for found, nominal in zip((origin, direction), straight, strict=True):
         keep = np.ones((2, 8), bool)
@@ -180,7 +184,8 @@ def test_a_crooked_sensor_measures_along_its_own_ray(xp: ModuleType) -> None:
     pose = xp.array(_f32([0.45, 0.0, 0.0]))
     yaw = np.zeros((1, 8), np.float32)
     yaw[0, 7] = -0.29920  # straight ahead
-    found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, xp.array(yaw))[0]
+    mount = Mount(turn=xp.array(yaw))
+    found = infrared.distances(pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, xp, mount)[0]
     # The wall is 0.05 m ahead of the centre. The two front sensors sit 0.030 m ahead of the centre.
     np.testing.assert_allclose(
         found[np.array([0, 7])], [0.020 / math.cos(0.30081), 0.020], atol=ROUNDING
@@ -205,7 +210,7 @@ def test_sights_tell_how_bright_the_nearest_thing_is(xp: ModuleType) -> None:
     pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0], [0.2, 0.3, 0.0]))
     box = xp.array(_f32([-0.45, -0.06, 0.0, 0.01, 0.01], [0.2, 0.0, 0.0, 0.02, 0.02]))
     distance, bright = infrared.sights(
-        pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
+        pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount(), xp
     )
     expected = np.ones((3, 8))  # 1 where a sensor sees nothing
     expected[0, 5] = 0.4
@@ -226,7 +231,7 @@ def test_what_has_no_reflectance_of_its_own_is_as_bright_as_can_be(xp: ModuleTyp
     pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0]))
     only_robots = _reflectance(xp, robot=(0.38, 0.38))
     _, bright = infrared.sights(
-        pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, only_robots, None, xp
+        pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, only_robots, Mount(), xp
     )
     expected = np.ones((2, 8))
     expected[0, 5] = expected[1, 2] = 0.38
@@ -243,7 +248,7 @@ def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
     for x, shade in ((0.45, 0.7), (0.472, 0.9)):
         pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
         distance, bright = infrared.sights(
-            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), None, xp
+            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount(), xp
         )
         np.testing.assert_array_equal(np.asarray(distance)[0, [0, 7]], 0.0)
         np.testing.assert_allclose(np.asarray(bright)[0, [0, 7]], shade, atol=ROUNDING)
@@ -253,10 +258,11 @@ def _no_box(xp: ModuleType) -> Any:
     return xp.zeros((0, 5), xp.float32)
 
 
-def _judge(stage: StageConfig) -> Judge:
+def _judge(stage: StageConfig, poses: Poses = epuck.SENSOR_POSES) -> Judge:
     """Returns a judge whose policy is never run."""
-    layer = (np.zeros((1, observation.SIZE, 2)), np.zeros((1, 2)))
-    size = np.zeros((1, observation.SIZE))
+    seen = observation.describe("metric", sensors=len(poses))
+    layer = (np.zeros((1, len(seen["names"]), 2)), np.zeros((1, 2)))
+    size = layer[0][..., 0]
     policy = Policy(
         layers=[layer],
         log_std=layer[1],
@@ -266,10 +272,11 @@ def _judge(stage: StageConfig) -> Judge:
         encoding="metric",
         max_speed=0.1256,
         max_turn_rate=3.14,
-        meta={"observation": observation.describe("metric")},
+        meta={"observation": seen, "sensors": {"poses": poses}},
         digest="",
     )
-    return engine_c.load(EvaluateConfig(policy="", stage=stage, robot=RobotConfig()), policy)
+    robot = RobotConfig(sensor_poses=tuple(poses))
+    return engine_c.load(EvaluateConfig(policy="", stage=stage, robot=robot), policy)
 
 
 ROBOTS, BOXES, ARENAS = 5, 2, 200
@@ -311,19 +318,27 @@ def _box_gap(point: np.ndarray, box: np.ndarray) -> float:
     return math.hypot(max(x, 0.0), max(y, 0.0)) + min(max(x, y), 0.0)
 
 
+# Six sensors of a robot of one's own, 2 mm behind the hull's surface.
+SIX = tuple(
+    (0.035 * math.cos(a), 0.035 * math.sin(a), a + 0.2) for a in (0.0, 0.5, 1.2, 3.0, 4.5, 6.0)
+)
+
+
+@pytest.mark.parametrize("poses", [epuck.SENSOR_POSES, SIX], ids=["epuck", "six"])
 @pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
-def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> None:
-    judge = _judge(StageConfig(name="test", robots=ROBOTS, side=SIDE, obstacles=BOXES))
+def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType, poses: Poses) -> None:
+    judge = _judge(StageConfig(name="test", robots=ROBOTS, side=SIDE, obstacles=BOXES), poses)
     pose, box = _scenes()
     data = np.empty(ARENAS, object)
     data[:] = [engine_c.place(judge, judge.model, *scene) for scene in zip(pose, box, strict=True)]
     seen_by_mujoco, _ = evaluate_rays.cast_rays(
         judge.scene, data, pose.astype(float), box.astype(float)
     )
-    found = np.array(_distances(pose, box, xp))
+    found = np.array(_distances(pose, box, xp, Mount(poses)))
+    assert found.shape == (ARENAS, ROBOTS, len(poses))
     # Enough rays meet something, and enough rays start inside something.
     assert (seen_by_mujoco < RANGE).sum() > 1000
-    assert (seen_by_mujoco == 0.0).sum() > 100
+    assert (seen_by_mujoco == 0.0).sum() > 90
     # Float32 rounds positions of up to 0.4 m to 3e-8 m, in JAX and in the walls' quaternions that
     # MuJoCo gets. A slanted face multiplies this error several times. The two distances of a ray
     # that grazes an edge could differ by its whole length, but none of these 8,000 rays is so close
@@ -331,15 +346,20 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType) -> N
     np.testing.assert_allclose(found, seen_by_mujoco, rtol=0, atol=5e-7)
 
 
-def _distances(pose: np.ndarray, box: np.ndarray, xp: ModuleType) -> Any:
+def _distances(pose: np.ndarray, box: np.ndarray, xp: ModuleType, mount: Mount) -> Any:
     """Returns the analytic distances of many arenas, by JAX in float32 or by NumPy in float64."""
     if xp is jnp:
         one = functools.partial(
-            infrared.distances, side=_f32(SIDE)[0], hull_radius=RADIUS, limit=RANGE, xp=jnp
+            infrared.distances,
+            side=_f32(SIDE)[0],
+            hull_radius=RADIUS,
+            limit=RANGE,
+            xp=jnp,
+            mount=mount,
         )
         return jax.vmap(lambda p, b: one(pose=p, obstacle=b))(pose, box)
     return [
-        infrared.distances(p, _f32(SIDE)[0], b, RADIUS, RANGE, np)
+        infrared.distances(p, _f32(SIDE)[0], b, RADIUS, RANGE, np, mount)
         for p, b in zip(pose.astype(float), box.astype(float), strict=True)
     ]
 
@@ -449,7 +469,7 @@ def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> Non
     )
     side = xp.full(MANY, ARENA, kind)
     pose, box = xp.array(pose, kind), xp.array(box, kind)
-    distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, None, xp)
+    distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, Mount(), xp)
     # Float32 rounds positions of up to 0.5 m to 3e-8 m. A slanted face or a chord of a hull
     # multiplies this error several times, here to 3.0e-7 m at most. In float64 an error of 1.3e-8 m
     # remains: the sensors' poses are float32 constants, so directions are longer or shorter than 1

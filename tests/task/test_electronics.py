@@ -103,17 +103,18 @@ def _first(electronics: Electronics, found: Factors, sight: Sight, xp: ModuleTyp
     ],
 )
 def test_reach(kind: Kind, encoding: Encoding, sensor_range: float, expected: float) -> None:
-    task = TaskConfig(sensor_range=sensor_range)
-    assert task_electronics.load(task, RealismConfig(infrared=kind), encoding).reach == expected
+    robot, realism = RobotConfig(sensor_range=sensor_range), RealismConfig(infrared=kind)
+    found = task_electronics.load(TaskConfig(), realism, encoding, robot=robot)
+    assert found.reach == expected
 
 
 def test_a_policy_observes_what_it_was_trained_to() -> None:
     assert _electronics(infrared="webots").encoding == "webots"
     assert _electronics(infrared="real").encoding == "metric"
     assert _electronics("metric", infrared="webots").encoding == "metric"
-    task = TaskConfig(encoding="webots", sensor_range=0.03, control_step=0.02)
+    task = TaskConfig(encoding="webots", control_step=0.02)
     found = task_electronics.load(task, RealismConfig())
-    assert (found.encoding, found.sensor_range, found.control_step) == ("webots", 0.03, 0.02)
+    assert (found.encoding, found.control_step) == ("webots", 0.02)
 
 
 @MODULES

@@ -249,9 +249,9 @@ def test_the_wheels_of_a_robot_are_alike() -> None:
 
 
 def test_no_draw_exceeds_the_largest_wheels() -> None:
-    assert factors.largest(ROBOT, RealismConfig()) == ROBOT
+    assert factors.largest(ROBOT, RealismConfig()).wheel_radius == ROBOT.wheel_radius
     wide = factors.largest(ROBOT, _realism(wheel_radius=(0.0198, 0.0207)))
-    assert wide == dataclasses.replace(ROBOT, wheel_radius=0.0207)
+    assert wide == dataclasses.replace(ROBOT, wheel_radius=0.0207, wheel_limit="clip")
 
 
 # --- independence

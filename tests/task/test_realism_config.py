@@ -218,8 +218,9 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["realism=webots", "realism.infrared=ideal"], "realism.infrared_noise is [1,1], but "
          "infrared is ideal and has no counts: give null, or infrared=webots or infrared=real."),
         # Impossible bodies.
-        (["robot.mass=-1"], "robot.mass is -1: give more than 0.01, at most 100."),
-        (["robot.mass=0.01"], "robot.mass is 0.01: give more than 0.01, at most 100."),
+        (["robot.mass=-1"], "robot.mass is -1: give more than 0, at most 100."),
+        (["robot.mass=0.01"], "robot.mass is 0.01, but wheel_mass is "
+         "0.005 and the mass includes two wheels: give more than 0.01."),
         (["realism.mass=[-0.1,0.2]"], "realism.mass is [-0.1,0.2]: give more than 0.01, at most "
          "100."),
         (["robot.effective_track=0.074"], "robot.effective_track is 0.074, but hull_radius is "
@@ -230,7 +231,7 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "is 0.037 and the wheels lie inside the hull: give less than 0.074."),
         (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give "
          "0.001 or more, less than 0.03."),
-        (["robot.hull_radius=0.029", "robot.wheel_radius=0.02",
+        (["robot.hull_radius=0.029", "robot.sensor_poses=[[0.02,0,0]]",
           "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
          "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
         # The wheels have 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6.
@@ -329,7 +330,10 @@ def test_a_range_begins_with_the_lower_number():
 def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     overview = " ".join(help_text(cls, command).split())
     assert f"realism={realism} (ideal, real, webots)" in overview
-    assert f"robot={robot} (paper, planar, planar_v2, wheeled, wheeled_v2)" in overview
+    assert (
+        f"robot={robot} (khepera4, paper, planar, planar_v2, thymio2, wheeled, wheeled_v2)"
+        in overview
+    )
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
         f"realism.mass={mass} mass, kg; per robot and episode "

@@ -1,0 +1,73 @@
+"""Checks the infrared sensors of a robot: where they sit, how far they see, what they read."""
+
+import itertools
+import math
+
+from swarmjax.config import ConfigError, show
+
+Pose = tuple[float, float, float]  # x (m), y (m), yaw (rad)
+Point = tuple[float, float, float]  # ray length (m), value, relative deviation
+MOST = 32  # sensors of a robot; a lidar needs other code
+MOST_YAW = 6.2832  # rad; a whole turn
+MOST_VALUE = 1e6  # counts; converters have 24 bits at most
+_ROUNDING = 1e-9  # m; a sensor may sit on the hull's surface
+
+
+def way_to_hull(pose: Pose, hull_radius: float) -> float:
+    """Returns how far a ray runs within its own hull, m.
+
+    Args:
+      pose: place and direction of the sensor.
+      hull_radius: m.
+    """
+    x, y, yaw = pose
+    outward = x * math.cos(yaw) + y * math.sin(yaw)
+    spare = max(0.0, hull_radius**2 - x**2 - y**2)
+    return math.sqrt(outward**2 + spare) - outward
+
+
+def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> None:
+    """Refuses sensors outside the hull, and sensors that see nothing beyond it.
+
+    Args:
+      poses: place and direction of each sensor.
+      hull_radius: m.
+      reach: range of the sensors, m.
+
+    Raises:
+      ConfigError: a sensor is impossible.
+    """
+    if not 1 <= len(poses) <= MOST:
+        raise ConfigError(f"sensor_poses has {len(poses)} sensors: give 1 to {MOST}.")
+    for i, pose in enumerate(poses):
+        away = math.hypot(*pose[:2])
+        if away > hull_radius + _ROUNDING:
+            raise ConfigError(
+                f"sensor_poses holds {show(pose)} for sensor {i}, {away:.4g} m from the middle, "
+                f"but hull_radius is {show(hull_radius)}: move the sensor to at most that, or give "
+                "a larger hull."
+            )
+        within = way_to_hull(pose, hull_radius)
+        if within >= reach:
+            raise ConfigError(
+                f"sensor_range is {show(reach)}, but the ray of sensor {i}, {show(pose)}, runs "
+                f"{within:.4g} m within its own hull and would see nothing: give a larger range, "
+                "or turn or move the sensor outwards."
+            )
+
+
+def check_response(points: tuple[Point, ...]) -> None:
+    """Refuses a table that cannot be read in both directions.
+
+    Args:
+      points: ray length, value and relative deviation, nearest first.
+
+    Raises:
+      ConfigError: lengths do not rise, or values do not fall.
+    """
+    pairs = itertools.pairwise(points)
+    if len(points) < 2 or any(a[0] >= b[0] or a[1] <= b[1] for a, b in pairs):
+        raise ConfigError(
+            f"sensor_response is {show(points)}: give two or more rows [distance, value, relative "
+            "deviation], with rising distances and falling values."
+        )
