@@ -21,12 +21,12 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
     """
     if not _is_sequence(choice):
         return [_named(stage, choice)]
-    _check_name(stage, choice)
-    for key in stage.keys() - {"sequence", "name"}:
+    for key in sorted(stage.keys() - {"sequence", "name"}):
         raise ConfigError(
             f"stage.{key} cannot be given for {choice}, a curriculum: choose one stage, as in "
-            "stage=s6."
+            f"stage=s6 (in a recipe: 'stage: s6', and 'stage.{key}: {show(stage[key])}' below it)."
         )
+    _check_name(stage, choice)
     return _sequence(stage["sequence"], choice)
 
 

@@ -99,6 +99,16 @@ def test_a_base_that_cannot_be_found_is_refused(own: Path, base: str) -> None:
     )
 
 
+def test_a_stage_written_out_needs_one_that_it_changes(own: Path) -> None:
+    own.write_text("stage: {name: mine, robots: 3, side: 1.0}\n")
+    assert refusal(load_train, [f"recipe={own}"]) == (
+        "stage.robots cannot be given for curriculum, a curriculum: choose one stage, as in "
+        "stage=s6 (in a recipe: 'stage: s6', and 'stage.robots: 3' below it)."
+    )
+    own.write_text("stage: s6\nstage.robots: 3\n")
+    assert load_train([f"recipe={own}"]).stage == load_train(["stage=s6", "stage.robots=3"]).stage
+
+
 def test_an_unknown_key_names_the_file(own: Path) -> None:
     own.write_text("stages: s3\n")
     assert refusal(load_train, [f"recipe={own}"]) == (

@@ -155,7 +155,7 @@ def test_import_needs_neither_jax_nor_hydra():
          "wheeled_v2."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
-         "one stage, as in stage=s6."),
+         "one stage, as in stage=s6 (in a recipe: 'stage: s6', and 'stage.side: 0.9' below it)."),
         (["stage.sequence=[s1,s9]"], f"stage.sequence is 's9': give one of {CHOICES} (nearest: "
          "s6), or a file .yaml."),
         (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
