@@ -151,8 +151,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or a file .yaml."),
         (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}, or a file .yaml."),
         (["stage=null"], f"stage is 'null': give one of {CHOICES}, or a file .yaml."),
-        (["robot=legged"], "robot is 'legged': give one of paper, planar, planar_v2, wheeled, "
-         "wheeled_v2."),
+        (["robot=legged"], "robot is 'legged': give one of khepera4, paper, planar, planar_v2, "
+         "thymio2, wheeled, wheeled_v2."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
          "one stage, as in stage=s6 (in a recipe: 'stage: s6', and 'stage.side: 0.9' below it)."),
