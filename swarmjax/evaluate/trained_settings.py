@@ -5,7 +5,7 @@ the command line sets them. The judge's body and the friction of hulls do not co
 default the body has wheels and hulls rub as in Webots, so that all policies are judged alike.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -106,12 +106,13 @@ def load[C: Section](
         metas = {each.path: each.policy.meta for each in entrants}
         typed = [f"policy={','.join(metas)}", *typed]
     trainings = [trained(meta, path) for path, meta in metas.items()]
+    limits = {meta["task"].get("step_limit") for meta in metas.values()} - {None}
     words = [_words(cls, each, typed) for each in trainings]
     _check_alike(cls, list(metas), words, typed)
     if stage is None and trainings and trainings[0].stages:
         stage = trainings[0].stages[-1]
     settings = stage_files.load_levels(cls, [*(words[0] if words else ()), *typed], stage)
-    return settings, _say(settings, typed)
+    return settings, _say(settings, typed, limits)
 
 
 def _paths(cls: type[Section], typed: Sequence[str]) -> list[str]:
@@ -151,10 +152,13 @@ def _check_alike(
                 )
 
 
-def _say(settings: Any, typed: Sequence[str]) -> str:
+def _say(settings: Any, typed: Sequence[str], limits: Collection[int]) -> str:
     """Describes in one line the robot and task that the policies run with."""
     given = [word for word in typed if word.partition("=")[0].partition(".")[0] in _SHOWN]
     levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
     what = describe(settings.robot, settings.task, settings.realism)
     but = f" but for {' '.join(given)}" if given else ""
-    return f"as trained{but}: {what}; {settings.robot.body} body, {levels}"
+    steps = "" if settings.suite else f", {settings.step_limit:,} control steps an episode"
+    if steps and {*limits} - {settings.step_limit}:
+        steps += f" (in training {', '.join(f'{each:,}' for each in sorted(limits))})"
+    return f"as trained{but}: {what}; {settings.robot.body} body, {levels}{steps}"

@@ -100,8 +100,11 @@ def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
         "as trained but for robot.sensor_range=0.05: hull 0.044 m of friction 1, infrared to "
     )
     assert said.endswith(
-        "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3"
+        "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3, 1,500 "
+        "control steps an episode (in training 500)"
     )
+    alike = trained_settings.load(EvaluateConfig, [odd, "steps=500"])[1]
+    assert alike.endswith("stage s3, 500 control steps an episode")
 
 
 def test_the_first_line_does_not_take_a_file_of_realism_for_a_preset(tmp_path: Path) -> None:
