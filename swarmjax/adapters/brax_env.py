@@ -30,7 +30,7 @@ class SwarmBraxEnv(_base.Env):
     Use `wrap_env=False`, because this class already maps and restarts the arenas. When an episode
     ends, the returned observation belongs to the next episode. Brax's evaluator ends a robot's
     episode when the robot arrives. The evaluator's metric `eval/episode_reached` is the share of
-    targets reached.
+    targets reached. `info["is_success"]` is True in the step in which a robot arrives.
 
     A robot that has arrived waits for the others, and nothing must be learned from its transitions
     while it waits. Brax cannot mask transitions, so these are marked as truncated. Marked
@@ -74,8 +74,9 @@ class SwarmBraxEnv(_base.Env):
             raise ValueError(f"num_envs is {len(rng)}: give {self.num_envs}, the number of robots.")
         now, zero = self.robots.swarm.reset(rng[0]), jnp.zeros(self.num_envs)
         info = dict.fromkeys(("truncation", "episode_done", "steps"), zero)
+        info |= {"is_success": jnp.zeros(self.num_envs, bool), "episode_metrics": {}}
         seen, metrics = self.robots.observe(now), {"reached": zero}
-        return _base.State(now, seen, zero, zero, metrics, info | {"episode_metrics": {}})
+        return _base.State(now, seen, zero, zero, metrics, info)
 
     def step(self, state: Any, action: Array) -> Any:
         """Makes a control step, and returns the state after it.
@@ -99,7 +100,7 @@ class SwarmBraxEnv(_base.Env):
             reward=came.reward,
             done=done,
             metrics={"reached": jnp.float32(came.terminated)},
-            info=state.info | noted,
+            info=state.info | noted | {"is_success": came.terminated},
         )
 
 

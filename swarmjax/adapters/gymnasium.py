@@ -26,8 +26,8 @@ class SwarmVectorEnv(_vector.VectorEnv):
     `terminated` in the last step of the episode. Robots that ran out of time are `truncated`.
 
     Autoreset is `SAME_STEP`. When an episode ends, the returned observation belongs to the next
-    episode, and `info["final_obs"]` holds the last observation of the old one. Absent robots are
-    left out.
+    episode, and `info["final_obs"]` holds the last observation of the old one.
+    `info["final_info"]["is_success"]` says which robots arrived. Absent robots are left out.
 
     Attributes:
       arena: [N] the arena of each sub-environment.
@@ -84,12 +84,12 @@ class SwarmVectorEnv(_vector.VectorEnv):
             final = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(came.over):
                 final[i] = came.last[i]
-            valid = {"valid": came.valid & came.over, "_valid": came.over}
+            ended = {"valid": came.valid & came.over, "is_success": came.is_success}
+            ended |= dict.fromkeys(("_valid", "_is_success"), came.over)
             info |= {"final_obs": final, "_final_obs": came.over}
-            info |= {"final_info": valid, "_final_info": came.over}
-        terminated = came.over & ~came.truncated
+            info |= {"final_info": ended, "_final_info": came.over}
         reward = came.reward.astype(np.float64)  # as in Gymnasium's own vector environments
-        return came.observation, reward, terminated, came.truncated, info
+        return came.observation, reward, came.is_success, came.truncated, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the session. `close` calls this method."""

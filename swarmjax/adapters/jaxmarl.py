@@ -26,8 +26,8 @@ class SwarmMultiAgentEnv(_base):
     A robot that arrives is done. The episode ends, and `__all__` is done, when all robots are done
     or the time runs out. Until then an arrived robot stands still: its reward is 0, `info["valid"]`
     is False, and none of its actions is available. `info` has arrays [N] over agents: `valid`,
-    `terminated` (the robot arrived in this step) and `truncated` (it ran out of time). `step`
-    starts the next episode automatically.
+    `terminated` (the robot arrived in this step), `truncated` (it ran out of time) and `is_success`
+    (the episode ended and the robot had arrived). `step` starts the next episode automatically.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -88,7 +88,8 @@ class SwarmMultiAgentEnv(_base):
         If the step ends the episode, the returned observation is the episode's last one.
         """
         state, came = self.robots.step(state, self._stack(actions))
-        info = {name: getattr(came, name) for name in ("valid", "terminated", "truncated")}
+        names = ("valid", "terminated", "truncated", "is_success")
+        info = {name: getattr(came, name) for name in names}
         dones = self._by_agent(_is_done(came)) | {"__all__": came.over[0]}
         return self._by_agent(came.last), state, self._by_agent(came.reward), dones, info
 

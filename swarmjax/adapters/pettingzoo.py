@@ -24,7 +24,8 @@ class SwarmParallelEnv(_base):
 
     A robot that arrives is terminated and leaves `agents`. It stays where it is, and the others
     drive around it. When the time runs out, the remaining agents are truncated. With
-    `task.arrival=hold` all robots leave in the same step. The environment never resets itself.
+    `task.arrival=hold` all robots leave in the same step. When a robot leaves, its info has
+    `is_success`: whether it arrived. The environment never resets itself.
 
     Attributes:
       agents: the robots that are still on their way.
@@ -95,7 +96,10 @@ class SwarmParallelEnv(_base):
             {agent: float(came.reward[i]) for agent, i in number.items()},
             {agent: bool(came.terminated[i]) for agent, i in number.items()},
             {agent: bool(came.truncated[i]) for agent, i in number.items()},
-            {agent: {} for agent in acted},
+            {
+                agent: {"is_success": bool(came.terminated[i])} if ended[i] else {}
+                for agent, i in number.items()
+            },
         )
 
     def close(self) -> None:

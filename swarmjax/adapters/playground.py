@@ -63,7 +63,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
         state, nothing = self.robots.swarm.reset(rng), jnp.zeros(())
         metrics = {"reached": nothing}
         seen = self.robots.observe(state).ravel()
-        return _state(state, seen, nothing, nothing, metrics, {})
+        return _state(state, seen, nothing, nothing, metrics, {"is_success": nothing > 0})
 
     def step(self, state: Any, action: Array) -> Any:
         """Makes a control step.
@@ -74,7 +74,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
         Returns:
           The state after the step. `metrics["reached"]` is the share of robots that arrived in this
-          step.
+          step, and `info["is_success"]` whether the episode ended with all robots at their targets.
 
         Raises:
           ValueError: if the action has a wrong shape or dtype.
@@ -89,6 +89,7 @@ class SwarmMjxEnv(_playground.MjxEnv):
             reward=came.reward.sum(),
             done=done.astype(jnp.float32),
             metrics={"reached": came.terminated.mean(dtype=jnp.float32)},
+            info=state.info | {"is_success": came.is_success.all()},
         )
 
     @property

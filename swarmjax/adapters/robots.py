@@ -35,6 +35,11 @@ class RobotStep(NamedTuple):
     valid: Any
     over: Any
 
+    @property
+    def is_success(self) -> Any:
+        """[N] whether the robot's episode ended in this step with the robot at its target."""
+        return self.over & ~self.truncated
+
 
 @dataclass(frozen=True, eq=False)
 class RobotRow:

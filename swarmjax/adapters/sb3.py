@@ -23,8 +23,8 @@ class SwarmVecEnv(_base):
     arena are done together, when its episode ends. A robot that has arrived stands still until
     then: its reward is 0, its actions are ignored, and its steps stay in the batch. In the last
     step, each info has `terminal_observation`. The info's entry `TimeLimit.truncated` says whether
-    the robot ran out of time. The returned observation then belongs to the next episode. Absent
-    robots are left out.
+    the robot ran out of time, and `is_success` whether it arrived. The returned observation then
+    belongs to the next episode. Absent robots are left out.
 
     Attributes:
       arena: [N] the arena of each environment.
@@ -85,6 +85,7 @@ class SwarmVecEnv(_base):
             infos[i] = {
                 "terminal_observation": came.last[i],
                 "TimeLimit.truncated": bool(came.truncated[i]),
+                "is_success": bool(came.is_success[i]),
             }
         return came.observation, came.reward, came.over, infos
 

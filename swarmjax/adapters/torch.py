@@ -21,7 +21,8 @@ class SwarmTorchEnv:
     Each robot is a row. All robots may share one policy. A step returns a `RobotStep`: act on
     `observation`, bootstrap from `last` where `truncated`, and learn where `valid`. A robot is
     `terminated` in the step in which it arrives. After that it is not `valid` and its reward is 0,
-    until its arena is `over` and starts the next episode automatically. Absent robots are left out.
+    until its arena is `over` and starts the next episode automatically. `is_success` then says
+    which robots had arrived. Absent robots are left out.
 
     JAX assumes that its arrays never change. So do not write into a tensor that this class has
     returned. Do not write into an action either, until the step that it was given to has returned.

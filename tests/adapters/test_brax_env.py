@@ -56,6 +56,7 @@ def test_nothing_is_learned_from_robots_that_wait(states: list, course: Course) 
         idle = robots(came.truncated[t] | ~came.valid[t])
         np.testing.assert_array_equal(state.info["truncation"], idle)
         np.testing.assert_array_equal(state.done, idle | robots(came.terminated[t]))
+        np.testing.assert_array_equal(state.info["is_success"], robots(came.terminated[t]))
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_the_last_observation_comes_with_the_first_of_the_next_episode(
     envs: SwarmVectorEnv, steps: list, course: Course
 ) -> None:
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    for (*_, info), done, last in zip(
+    for (_, _, terminated, _, info), done, last in zip(
         steps, course.came.done, course.came.observation, strict=True
     ):
         over = done[ARENAS]
@@ -80,6 +80,8 @@ def test_the_last_observation_comes_with_the_first_of_the_next_episode(
             np.testing.assert_array_equal(info["_final_obs"], over)
             np.testing.assert_array_equal(info["_final_info"], over)
             assert_close(np.stack(info["final_obs"][over]), robots(last)[over])
+            np.testing.assert_array_equal(info["final_info"]["_is_success"], over)
+            np.testing.assert_array_equal(info["final_info"]["is_success"], terminated)
             assert all(each is None for each in info["final_obs"][~over])
 
 

@@ -66,9 +66,11 @@ def test_who_arrives_is_done_until_all_are(steps: list) -> None:
 @pytest.mark.slow
 def test_infos_are_arrays_over_agents(steps: list, arena_course: Course) -> None:
     for t, (*_, info) in enumerate(steps):
-        assert sorted(info) == ["terminated", "truncated", "valid"]
+        assert sorted(info) == ["is_success", "terminated", "truncated", "valid"]
+        # agent_0 has arrived before the episode ends, and agent_1 never does.
+        success = np.array([t == LIMIT - 1, False])
         for name, found in info.items():
-            expected = getattr(arena_course.came, name)[t, 0]
+            expected = getattr(arena_course.came, name)[t, 0] if name != "is_success" else success
             np.testing.assert_array_equal(found, [expected, expected])
 
 

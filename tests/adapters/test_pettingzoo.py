@@ -47,14 +47,16 @@ def test_who_arrives_leaves(steps: list, arena_course: Course) -> None:
     assert arrived == 42  # see courses.py
     acting = [step[0] for step in steps]
     assert acting == [AGENTS] * 43 + [["robot_1"]] * (LIMIT - 43)
-    *_, terminated, truncated, _ = steps[42]
+    *_, terminated, truncated, infos = steps[42]
     assert terminated == {"robot_0": True, "robot_1": False}
     assert truncated == {"robot_0": False, "robot_1": False}
+    assert infos == {"robot_0": {"is_success": True}, "robot_1": {}}
 
 
 def test_who_is_late_is_truncated(steps: list) -> None:
-    *_, terminated, truncated, _ = steps[-1]
+    *_, terminated, truncated, infos = steps[-1]
     assert (terminated, truncated) == ({"robot_1": False}, {"robot_1": True})
+    assert infos == {"robot_1": {"is_success": False}}
 
 
 def test_observations_and_rewards_are_those_of_the_course(

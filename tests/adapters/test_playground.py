@@ -51,6 +51,7 @@ def test_it_follows_the_course(states: list, arena_course: Course) -> None:
         assert_close(state.reward, came.reward[t].sum())
         assert_close(state.metrics["reached"], came.terminated[t].sum() / 2)
         assert state.done == 0.0  # a robot times out, and only the wrapper reports that
+        assert not state.info["is_success"]
 
 
 @pytest.mark.slow
@@ -59,7 +60,10 @@ def test_done_says_that_all_have_arrived(env: SwarmMjxEnv, states: list) -> None
     arenas = state.data.arenas
     everyone = jnp.ones_like(arenas.arrived)
     state = state.replace(data=state.data.replace(arenas=arenas.replace(arrived=everyone)))
-    assert jax.jit(env.step)(state, jnp.zeros(4)).done == 1.0
+    last = jax.jit(env.step)(state, jnp.zeros(4))
+    assert last.done == 1.0
+    assert last.info["is_success"].dtype == bool
+    assert last.info["is_success"]
 
 
 @pytest.mark.slow

@@ -28,6 +28,22 @@ def test_the_course_has_all_that_can_happen(course: Course) -> None:
     assert (over.all(axis=-1).sum(axis=0) > 1).any()  # an arena ends two episodes
 
 
+def test_success_is_an_arrival_before_the_episode_ends(course: Course) -> None:
+    found, over = _arrived_in_time(course), course.came.done[:, ARENAS]
+    assert found.any()
+    assert (over & ~found).any()
+
+
+def _arrived_in_time(course: Course) -> np.ndarray:
+    """Remembers [T, N] who arrives in each episode until it ends."""
+    arrived, found = np.zeros(len(PLACES), bool), []
+    for done, terminated in zip(course.came.done, course.came.terminated, strict=True):
+        arrived |= robots(terminated)
+        found.append(arrived & done[ARENAS])
+        arrived = arrived & ~done[ARENAS]
+    return np.array(found)
+
+
 def test_robots_follow_the_course(swarm: Swarm, course: Course) -> None:
     row, state = line_up(swarm), jax.jit(swarm.reset)(drawn_key(SEED))
     step = jax.jit(row.step)
@@ -41,6 +57,7 @@ def test_robots_follow_the_course(swarm: Swarm, course: Course) -> None:
         for name in ("terminated", "truncated", "valid"):
             np.testing.assert_array_equal(getattr(found, name), robots(getattr(then, name)))
         np.testing.assert_array_equal(found.over, then.done[ARENAS])
+        np.testing.assert_array_equal(found.is_success, _arrived_in_time(course)[t])
 
 
 def test_several_arenas_are_refused(swarm: Swarm) -> None:

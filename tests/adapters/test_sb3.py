@@ -53,11 +53,12 @@ def test_infos_tell_the_last_observation_and_who_was_late(steps: list, course: C
         last, late = robots(course.came.observation[t]), robots(course.came.truncated[t])
         for i, info in enumerate(infos):
             assert set(info) == (
-                {"TimeLimit.truncated", "terminal_observation"} if done[i] else set()
+                {"TimeLimit.truncated", "terminal_observation", "is_success"} if done[i] else set()
             )
             if done[i]:
                 assert_close(info["terminal_observation"], last[i])
                 assert info["TimeLimit.truncated"] == late[i]
+                assert info["is_success"] is not bool(late[i])
 
 
 def test_seeds_reproduce(env) -> None:
@@ -75,6 +76,8 @@ def test_its_monitor_and_its_ppo_take_it(env) -> None:
     model.learn(96 * 6)
     assert len(model.ep_info_buffer) >= 6  # the time limit is 80 steps
     assert max(info["l"] for info in model.ep_info_buffer) == 80
+    assert set(model.ep_success_buffer) <= {False, True}
+    assert len(model.ep_success_buffer) == len(model.ep_info_buffer)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,8 @@ def test_it_follows_the_course(env, course: Course) -> None:
             assert found.dtype is torch.bool
             np.testing.assert_array_equal(found.numpy(), robots(getattr(then, name)))
         np.testing.assert_array_equal(came.over.numpy(), then.done[ARENAS])
+        success = then.done[ARENAS] & ~robots(then.truncated)
+        np.testing.assert_array_equal(came.is_success.numpy(), success)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bool_])
