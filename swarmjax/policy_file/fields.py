@@ -137,6 +137,7 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
         "memory.kind": _one_of("gru"),
         "memory.size": _whole(1, 1024),
     },
+    "task.step_limit": {"task.step_limit": _whole(1)},
     "observation.neighbours": {
         "observation.neighbours": _Rule(
             "none, since 8820a9f is the last commit that reads such a policy", lambda _: False
