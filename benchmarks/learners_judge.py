@@ -16,9 +16,10 @@ from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
 from swarmjax.task import level, placement
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, World
+from swarmjax.task.env import EnvState
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 from swarmjax.training import rollout
 
 

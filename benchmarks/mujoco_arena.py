@@ -60,6 +60,8 @@ class MujocoArena:
         """
         if settings.task.arrival != "latch":
             raise ConfigError(f"task.arrival is {settings.task.arrival}: give latch.")
+        if settings.task.goal != "navigate":
+            raise ConfigError(f"task.goal is {settings.task.goal}: give navigate.")
         for name in ("arrival", "path_progress"):
             weight = getattr(settings.task.reward, name)
             if weight:

@@ -51,7 +51,7 @@ from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.task import env
+from swarmjax.task import world as task_world
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
@@ -125,7 +125,7 @@ def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
     """Makes both trainers' judge; it maps learners [N=1, L=1] to the share of targets reached."""
     stage = trained.stage[-1]
     parts = trained.robot, trained.task, trained.realism, trained.sim
-    world = env.load((stage,), *parts, arenas=race.levels)
+    world = task_world.load((stage,), *parts, arenas=race.levels)
     levels = learners_judge.draw_levels(world, stage, race.level_seed, race.levels)
     ppo = programs.load_ppo(trained, world)
     run = partial(learners_judge.outcomes, world, ppo, steps=trained.task.step_limit)

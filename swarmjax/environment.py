@@ -18,8 +18,9 @@ from swarmjax import policy_file
 from swarmjax.sim import drive, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.task.stage import Stage
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
@@ -188,7 +189,7 @@ def load(config: ProgramConfig) -> Swarm:
       The environment.
 
     Raises:
-      ConfigError: a piece of an extension does not fit, or `task.env.load` refuses a setting.
+      ConfigError: a piece of an extension does not fit, or `task.world.load` refuses a setting.
     """
     world = programs.load_world(config)
     stages = task_stage.stack(config.stage, world.drawings)

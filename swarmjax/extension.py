@@ -1,9 +1,10 @@
-"""Your own pieces: rewards, observations, level drawings, networks and curricula, from a file.
+"""Your own pieces: rewards, observations, levels, networks, curricula and goals, from a file.
 
-A piece is a function with one of the decorators below; a network is a Flax module. Commands take
-the file as `extensions=FILE`. `make_env` and `train_policy` also take a module or a list of pieces.
-All pieces of a file are used unless a setting says otherwise. docs/extending.md has an example of
-each kind. Loading a file executes it. Importing this module does not import JAX.
+A piece is a function with one of the decorators below; a network is a Flax module, and a goal a
+class. Commands take the file as `extensions=FILE`. `make_env` and `train_policy` also take a module
+or a list of pieces. All pieces of a file are used unless a setting says otherwise.
+docs/extending.md has an example of each kind. Loading a file executes it. Importing this module
+does not import JAX.
 """
 
 import ast
@@ -36,6 +37,7 @@ TAKEN = {
     ),
     "network": ("mlp",),
     "curriculum": ("sequential", "mixed", "adaptive", "frontier"),
+    "goal": ("navigate", "lifelong", "gather", "cover"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _LARGEST = 3.4e38  # as in `config.section`: float32 holds nothing beyond
@@ -113,6 +115,12 @@ class OwnCurriculum(Piece):
     kind: ClassVar[str] = "curriculum"
 
 
+class OwnGoal(Piece):
+    """A goal: a subclass of `swarmjax.task.goals.goal.Goal`."""
+
+    kind: ClassVar[str] = "goal"
+
+
 def reward_term(weight: float, name: str | None = None) -> Callable[[Callable], RewardTerm]:
     """Turns a function into a term of the reward.
 
@@ -156,13 +164,24 @@ def network(module: type) -> Network:
 
     The name is that of the class in lower case, so that ResidualNet is residual_net.
     """
-    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", module.__name__).lower()
-    return Network(name=name, function=module)
+    return Network(name=_snake_case(module), function=module)
 
 
 def curriculum(function: Callable) -> OwnCurriculum:
     """Turns a function into a curriculum; `curriculum.mode` selects it."""
     return OwnCurriculum(name=function.__name__, function=function)
+
+
+def goal(goal: type) -> OwnGoal:
+    """Turns a subclass of `swarmjax.task.goals.goal.Goal` into a goal; `task.goal` selects it.
+
+    The name is that of the class in lower case, so that KeepApart is keep_apart.
+    """
+    return OwnGoal(name=_snake_case(goal), function=goal)
+
+
+def _snake_case(cls: type) -> str:
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
 
 class Extensions(NamedTuple):
@@ -174,6 +193,7 @@ class Extensions(NamedTuple):
       levels: ways to draw levels.
       networks: networks of actor and critic.
       curricula: ways to choose the next episodes.
+      goals: goals of robots.
     """
 
     rewards: tuple[RewardTerm, ...] = ()
@@ -181,6 +201,7 @@ class Extensions(NamedTuple):
     levels: tuple[LevelDrawing, ...] = ()
     networks: tuple[Network, ...] = ()
     curricula: tuple[OwnCurriculum, ...] = ()
+    goals: tuple[OwnGoal, ...] = ()
 
     def digests(self) -> ByName:
         """Returns the digest of each piece, by kind and name."""

@@ -21,8 +21,9 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env
 from swarmjax.task.config import RewardConfig, TaskConfig
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 
 ArenaStep = Callable[[EnvState, jax.Array], tuple[EnvState, TimeStep]]

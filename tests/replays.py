@@ -51,10 +51,12 @@ def wandering(robots: int, frames: int, seed: int = 0) -> Recording:
     return Recording(
         scene=ReplayScene(
             side=1.2,
-            target=draw.uniform(-0.5, 0.5, (robots, 2)),
             box=np.array([[0.1, -0.2, 0.3, 0.05, 0.05]]),
             sensor=np.tile([0.03, 0.01, 1.0, 0.0], (robots, 8, 1)),
         ),
+        target=np.tile(draw.uniform(-0.5, 0.5, (robots, 2)), (frames, 1, 1)),
+        earns=np.zeros((frames, robots), bool),
+        measured=np.zeros((frames, 0)),
         pose=np.concatenate([stride, turn], axis=-1).cumsum(axis=0),
         ray=np.where(lit, draw.uniform(0.0, 0.04, lit.shape), 0.04),
         distance=np.ones((frames, robots)),

@@ -100,7 +100,7 @@ class SwarmMultiAgentEnv(_base):
     def get_avail_actions(self, state: SwarmState) -> _ByAgent:
         """Returns for each agent whether its actions [U] are available; False after its arrival."""
         arrived = state.arenas.arrived[0, self.robots.index]
-        free = ~arrived | (self.robots.swarm.world.task.arrival == "hold")
+        free = self.robots.swarm.world.goal.drives(arrived)
         return self._by_agent(jnp.repeat(free[:, None], self.robots.action_size, axis=1))
 
     def _by_agent(self, x: Array) -> _ByAgent:

@@ -27,10 +27,11 @@ from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps, noise
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.noise import Stream
-from swarmjax.task import arrival, electronics, level, observation
+from swarmjax.task import electronics, level, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.factors import Factors
+from swarmjax.task.goals.goal import Turn
 from swarmjax.task.level import Level
 
 
@@ -42,9 +43,11 @@ class Arenas(NamedTuple):
       data: [A] of `MjData`, positions up to date.
       factors: [A] factors of the episodes' robots.
       memory: [A] state of the robots' electronics.
-      target: [A, R, 2] x (m), y (m).
+      target: [A, R, 2] targets of now, x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       level: [A] levels that the episodes started from.
+      goal: [A] state of the goal.
+      earns: [A, R] whether the last step earned the reward `arrival`.
       pose: [A, R, 3] x (m), y (m), yaw (rad).
       observation: [A, R, O].
       apart: [A, R, 3] time since the last contact of each kind, s.
@@ -58,6 +61,8 @@ class Arenas(NamedTuple):
     target: np.ndarray
     obstacle: np.ndarray
     level: Level
+    goal: Any
+    earns: np.ndarray
     pose: np.ndarray
     observation: np.ndarray
     apart: np.ndarray
@@ -106,12 +111,17 @@ def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
         arenas = step(judge, arenas, action)
         for whole, part in zip(total, arenas.outcome, strict=True):
             whole[rows] = part
-        running = ~arenas.outcome.arrived.all(axis=-1)
+        running = ~is_over(judge, arenas.outcome)
         if not running.all():
             rows, arenas, memory = rows[running], *(_select(x, running) for x in (arenas, memory))
         if not len(rows):
             break
     return total
+
+
+def is_over(judge: Judge, outcome: Outcome) -> np.ndarray:
+    """Returns whether episodes [A] end because all robots have arrived."""
+    return judge.goal.is_over(outcome.arrived, np.ones_like(outcome.arrived))
 
 
 def _select(tree: Any, rows: Any) -> Any:
@@ -120,7 +130,8 @@ def _select(tree: Any, rows: Any) -> Any:
         return None
     if isinstance(tree, np.ndarray):
         return tree[rows]
-    return type(tree)(*(_select(part, rows) for part in tree))
+    parts = [_select(part, rows) for part in tree]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else type(tree)(parts)
 
 
 def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
@@ -143,9 +154,12 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
     model = _models(judge, factors, obstacle[..., 3:])
     data = np.empty(len(levels), object)
     data[:] = [place(judge, *each) for each in zip(model, pose, obstacle, begun.side, strict=True)]
-    outcome = measures.begin(pose[..., :2], np)
+    goal, target = judge.goal.begin(begun._replace(target=target))
+    outcome = measures.begin(pose[..., :2], np, len(judge.goal.measures))
     sight = look(judge, data, factors, pose, target, obstacle)
-    sight = _look_by_extension(judge, sight, pose, begun, outcome.arrived, outcome.clock)
+    sight = _look_by_extension(
+        judge, sight, pose, begun._replace(target=target), outcome.arrived, outcome.clock
+    )
     memory, seen = electronics.begin(judge.electronics, factors, sight, outcome.clock, np)
     return Arenas(
         model=model,
@@ -155,6 +169,8 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
         target=target,
         obstacle=obstacle,
         level=begun,
+        goal=goal,
+        earns=outcome.arrived,
         pose=pose,
         observation=seen,
         apart=np.full(outcome.contacts.shape, gaps.CONTACT_PAUSE),
@@ -241,15 +257,16 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         if judge.policy.carried:
             raise PolicyError("the policy has a memory: pass the action that `act` chooses.")
         _, action = act(judge, None, arenas)
-    active = arrival.drives(task.arrival, before)
+    active, present = judge.goal.drives(before), np.ones_like(before)
     memory, pose = _drive(judge, arenas, action, active)
     sight = look(judge, arenas.data, arenas.factors, pose, arenas.target, arenas.obstacle)
-    arrived = arrival.arrived(task.arrival, before, sight.distance <= task.target_radius)
+    clock = arenas.outcome.clock + 1
+    turn, level, sight = _turn(judge, arenas, sight, pose)
+    arrived = turn.arrived
     touches = contacts.touching(judge, arenas.data)
     gap = np.where(touches, 0.0, np.inf)
     begins, apart = gaps.count_contacts(gap, arenas.apart, task.control_step, np)
-    clock = arenas.outcome.clock + 1
-    sight = _look_by_extension(judge, sight, pose, arenas.level, arrived, clock)
+    sight = _look_by_extension(judge, sight, pose, level, arrived, clock)
     memory, seen = electronics.sense(judge.electronics, memory, arenas.factors, sight, clock, np)
     events = measures.Events(
         start=arenas.pose[..., :2],
@@ -258,9 +275,34 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         begins=begins,
         touches=touches,
         sensed=(sight.ray < judge.config.robot.sensor_range).any(axis=-1),
+        measured=judge.goal.measured(turn),
     )
     outcome = measures.tally(arenas.outcome, events, np)
-    return arenas._replace(memory=memory, pose=pose, observation=seen, apart=apart, outcome=outcome)
+    ends = judge.goal.terminates(before, arrived, present)
+    return arenas._replace(
+        memory=memory,
+        target=level.target,
+        goal=turn.state,
+        earns=ends if turn.earns is None else turn.earns,
+        pose=pose,
+        observation=seen,
+        apart=apart,
+        outcome=outcome,
+    )
+
+
+def _turn(
+    judge: Judge, arenas: Arenas, sight: Sight, pose: np.ndarray
+) -> tuple[Turn, Level, Sight]:
+    """Asks the goal; returns its answer, levels with the new targets, and the sight of them."""
+    levels, before = arenas.level._replace(target=arenas.target), arenas.outcome
+    view = electronics.view(sight, pose, levels, before.arrived, before.clock + 1)
+    turn = judge.goal.advance(arenas.goal, levels, view)
+    if not judge.goal.moves:
+        return turn, levels, sight
+    levels = levels._replace(target=np.asarray(turn.target, np.float64))
+    distance, bearing = observation.to_target(pose, levels.target, np)
+    return turn, levels, sight._replace(distance=distance, bearing=bearing)
 
 
 def _look_by_extension(

@@ -26,11 +26,13 @@ from swarmjax.policy import Policy
 from swarmjax.sim import noise, physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.sim.noise import Stream
-from swarmjax.task import arrival, env
+from swarmjax.task import env
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, World
+from swarmjax.task import world as task_world
+from swarmjax.task.env import EnvState
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 from swarmjax.training import rollout
 
 _ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
@@ -56,7 +58,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
     sim = SimConfig(
         max_robots=stage.robots, max_obstacles=len(half), substeps=judge.substeps(config)
     )
-    return env.load(
+    return task_world.load(
         (stage,),
         config.robot,
         config.task,
@@ -183,7 +185,7 @@ def run(
     arenas = jax.vmap(lambda each: env.reset(world, each))(levels)
     unpack = partial(physics.unpack, world.physics)
     arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
-    outcome = measures.begin(levels.start[..., :2], jnp)
+    outcome = measures.begin(levels.start[..., :2], jnp, len(world.goal.measures))
     unbroken = jnp.zeros(len(levels.side), bool)
     step = partial(_step, world, act)
     carry = (arenas, outcome, unbroken, memory)
@@ -204,11 +206,11 @@ def _step(
     arenas, outcome, broken, memory = carry
     memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
-    over = broken | arrival.complete(arenas.arrived, arenas.level.present)
+    over = broken | world.goal.is_over(arenas.arrived, arenas.level.present)
     broken = broken | (~over & ~came.sound)
     stays = over | broken
     held = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
-    counted = measures.tally(outcome, _events(world, arenas, moved), jnp)
+    counted = measures.tally(outcome, _events(world, arenas, moved, came), jnp)
     outcome = jax.tree.map(
         lambda old, new: jnp.where(stays.reshape(-1, *[1] * (new.ndim - 1)), old, new),
         outcome,
@@ -217,7 +219,7 @@ def _step(
     return (rollout.restart(moved, held, stays), outcome, broken, memory), None
 
 
-def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
+def _events(world: World, before: EnvState, after: EnvState, came: env.TimeStep) -> measures.Events:
     """Returns the events of a control step; training has counted contacts and infrared."""
     poses = jax.vmap(partial(physics.poses, world.physics))
     return measures.Events(
@@ -227,4 +229,5 @@ def _events(world: World, before: EnvState, after: EnvState) -> measures.Events:
         begins=after.episode.contacts - before.episode.contacts,
         touches=after.apart == 0.0,
         sensed=after.episode.sensed > before.episode.sensed,
+        measured=came.measured,
     )

@@ -24,6 +24,8 @@ from swarmjax.task import factors as task_factors
 from swarmjax.task import level, observation, room
 from swarmjax.task import stage as task_stage
 from swarmjax.task.electronics import Electronics
+from swarmjax.task.goals import load as task_goals
+from swarmjax.task.goals.goal import Goal
 from swarmjax.task.observation import View
 from swarmjax.task.stage_config import StageConfig
 
@@ -42,6 +44,7 @@ class Judge:
       drive: The robot's drive, with the range of commands that the policy was trained for.
       electronics: The electronics between policy and world, with the observations of the policy's
         training.
+      goal: What the robots are asked to do.
       model: The compiled arena.
       ids: Rows of the model's moving bodies.
       scene: The scene for infrared rays.
@@ -58,6 +61,7 @@ class Judge:
     spacing: level.Spacing
     drive: sim_drive.Drive
     electronics: Electronics
+    goal: Goal
     model: mujoco.MjModel
     ids: sim_model.Ids
     scene: RayScene
@@ -105,6 +109,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
             max_speed=trained.max_speed, max_turn_rate=trained.max_turn_rate
         ),
         electronics=electronics,
+        goal=_load_goal(config, extensions),
         model=compiled,
         ids=ids,
         scene=RayScene(
@@ -166,6 +171,19 @@ def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation,
     return tuple(each for name in names for each in extensions.observations if each.name == name)
 
 
+def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
+    """Makes the goal; that of an extension runs with JAX."""
+    goal = task_goals.load(config.task, config.robot, extensions.goals)
+    own = [piece for piece in extensions.goals if piece.name == config.task.goal]
+    if not own:
+        return goal
+    from swarmjax.task import extended
+
+    stage = config.stage
+    extended.check_goal(own[0], goal, config.robot, stage.robots, stage.obstacles)
+    return extended.SideBySide(goal)
+
+
 def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | None:
     """Compiles observations of an extension, for arenas side by side."""
     if not own:
@@ -195,8 +213,9 @@ def check_policy(
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
     extension.check_needs(needs, extensions, str(path), ["observation", "network"])
-    if stage.level in needs.get("level", {}):
-        extension.check_needs(needs, extensions, str(path), ["level"])
+    for kind, name in (("level", stage.level), ("goal", config.task.goal)):
+        if name in needs.get(kind, {}):
+            extension.check_needs(needs, extensions, str(path), [kind])
     layout = trained.meta["observation"]
     own, poses = _observations(extensions, trained), config.robot.sensor_poses
     _check_sensors(path, trained, poses)

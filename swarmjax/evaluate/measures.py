@@ -4,11 +4,13 @@ Every measure is one number per level; docs/evaluation.md gives its formula. The
 events of each control step to `tally`, and nothing here depends on the engine.
 """
 
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarmjax.sim import gaps
+from swarmjax.task.goals.goal import Measure
 
 # A robot is in a deadlock if, at the time-out, it has not arrived and does not move (Grover, Liu &
 # Sycara 2020, "Deadlock Analysis and Resolution in Multi-Robot Systems"). It does not move if it is
@@ -37,6 +39,7 @@ class Outcome(NamedTuple):
       still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of one
         place; 0 if it has arrived.
       anchor: [A, R, 2] that place, m.
+      measured: [A, K] the goal's own measures.
     """
 
     clock: Any
@@ -49,6 +52,7 @@ class Outcome(NamedTuple):
     path: Any
     still: Any
     anchor: Any
+    measured: Any
 
 
 class Events(NamedTuple):
@@ -61,6 +65,7 @@ class Events(NamedTuple):
       begins: [A, R, 3] whether a contact begins, by kind.
       touches: [A, R, 3] whether the robot touches something at the end of the step.
       sensed: [A, R] whether an infrared ray met something in range.
+      measured: [A, K] the goal's own measures.
     """
 
     start: Any
@@ -69,14 +74,16 @@ class Events(NamedTuple):
     begins: Any
     touches: Any
     sensed: Any
+    measured: Any
 
 
-def begin(place: Any, xp: Any) -> Outcome:
+def begin(place: Any, xp: Any, own: int = 0) -> Outcome:
     """Returns the outcome of episodes that have just begun.
 
     Args:
       place: [A, R, 2] starts of the robots, m.
       xp: `numpy` or `jax.numpy`.
+      own: Number of the goal's own measures, K.
     """
     count = xp.zeros(place.shape[:2], int)
     by_kind = xp.zeros((*count.shape, len(gaps.KINDS)), int)
@@ -91,6 +98,7 @@ def begin(place: Any, xp: Any) -> Outcome:
         path=count.astype(float),
         still=count,
         anchor=place,
+        measured=xp.zeros((len(place), own), xp.float32),
     )
 
 
@@ -117,22 +125,8 @@ def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
         path=before.path + xp.where(under_way, driven, 0.0),
         still=xp.where(away | step.arrived, 0, before.still + 1),
         anchor=xp.where(away[..., None], step.place, before.anchor),
+        measured=step.measured,
     )
-
-
-class Measure(NamedTuple):
-    """A figure with one number per level.
-
-    Attributes:
-      label: Name of the measure in a table.
-      unit: Unit of the number. `%` means a share of 0 to 1 that is shown in per cent. A count has
-        no unit.
-      is_good: Whether larger numbers are better.
-    """
-
-    label: str
-    unit: str
-    is_good: bool = False
 
 
 def _by_kind(name: str, label: str, unit: str) -> dict[str, Measure]:
@@ -156,7 +150,11 @@ MEASURES: dict[str, Measure] = {
 
 
 def per_level(
-    outcome: Outcome, control_step: float, steps: int, shortest: np.ndarray | None = None
+    outcome: Outcome,
+    control_step: float,
+    steps: int,
+    shortest: np.ndarray | None = None,
+    own: Collection[str] = (),
 ) -> dict[str, np.ndarray]:
     """Computes the measures of each episode.
 
@@ -166,9 +164,11 @@ def per_level(
       steps: Control steps until the time is out.
       shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
         Without `shortest` there is no path efficiency.
+      own: Names of the goal's own measures.
 
     Returns:
-      An array [A] for each of the `MEASURES` that can be computed, in the same order.
+      An array [A] for each of the `MEASURES` that can be computed, in the same order, and then for
+      the goal's own.
     """
     late = ~outcome.arrived
     arrival = np.where(late, steps, outcome.arrival) * control_step
@@ -185,7 +185,9 @@ def per_level(
     }
     if shortest is not None:
         values["spl"] = _efficiency(outcome, shortest).mean(axis=-1)
-    return {name: values[name].astype(float) for name in MEASURES if name in values}
+    values = {name: values[name] for name in MEASURES if name in values}
+    values |= {name: outcome.measured[:, i] for i, name in enumerate(own)}
+    return {name: value.astype(float) for name, value in values.items()}
 
 
 def _split(name: str, values: np.ndarray) -> dict[str, np.ndarray]:

@@ -40,8 +40,10 @@ def result(
     """
     about = [[{"path": path, "digest": trained.digest} for path, trained in each] for each in sides]
     is_one = len(sides) == 1
+    own = {name: measure._asdict() for name, measure in trials[0].own.items()}
     return {
         **_about(config, suite),
+        **({"own_measures": own} if own else {}),
         **({"policies": about[0]} if is_one else {"compared": about}),
         "cells": [
             about_cell(config, trial) | {"measures": _figures([trial], is_one=is_one)}
@@ -59,11 +61,12 @@ def _figures(
         name: np.concatenate([trial.measures[name] for trial in trials], axis=1)
         for name in trials[0].measures
     }
+    about = {**MEASURES, **trials[0].own}
     if is_one:
-        return summarize(measured, strata)
+        return summarize(measured, strata, about)
     halves = {name: np.split(table, 2) for name, table in measured.items()}
     a, b = ({name: half[side] for name, half in halves.items()} for side in (0, 1))
-    return compare(a, b, strata)
+    return compare(a, b, strata, about)
 
 
 def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
@@ -103,19 +106,24 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
     }
 
 
-def summarize(measured: Measured, strata: Sequence[int] | None = None) -> dict[str, dict[str, Any]]:
+def summarize(
+    measured: Measured,
+    strata: Sequence[int] | None = None,
+    about: Mapping[str, Measure] = MEASURES,
+) -> dict[str, dict[str, Any]]:
     """Summarises measures.
 
     Args:
       measured: Values [P, E] of each measure, from policies of one recipe on the same levels.
       strata: Sizes of groups of consecutive levels; levels are drawn within each group.
+      about: The measures.
 
     Returns:
       For each measure `mean`, `iqm` and `cvar` (mean over the worst 5 % of the levels and
       policies). Each of the three has an interval, under its name with `_interval` appended. The
       interval is null if there are too few values.
     """
-    return {name: _summary(table, MEASURES[name], strata) for name, table in measured.items()}
+    return {name: _summary(table, about[name], strata) for name, table in measured.items()}
 
 
 def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) -> dict[str, Any]:
@@ -167,7 +175,10 @@ def _share(a: Cell, b: Cell) -> bool:
 
 
 def compare(
-    a: Measured, b: Measured, strata: Sequence[int] | None = None
+    a: Measured,
+    b: Measured,
+    strata: Sequence[int] | None = None,
+    about: Mapping[str, Measure] = MEASURES,
 ) -> dict[str, dict[str, Any]]:
     """Compares two recipes level by level.
 
@@ -175,19 +186,20 @@ def compare(
       a: Values [P, E] of each measure for the first recipe.
       b: Values [P, E] for the second recipe, on the same levels; equal rows have equal seeds.
       strata: As in `summarize`.
+      about: As in `summarize`.
 
     Returns:
       For each measure that both have, the means `a` and `b`; `difference`, b - a of the means; and
       `improvement`, the probability that b is better on a level. Each of the last two has an
       interval, under its name with `_interval` appended.
     """
-    return {name: _comparison(name, a[name], b[name], strata) for name in a if name in b}
+    return {name: _comparison(about[name], a[name], b[name], strata) for name in a if name in b}
 
 
 def _comparison(
-    name: str, a: np.ndarray, b: np.ndarray, strata: Sequence[int] | None
+    measure: Measure, a: np.ndarray, b: np.ndarray, strata: Sequence[int] | None
 ) -> dict[str, Any]:
-    better, worse = (b, a) if MEASURES[name].is_good else (a, b)
+    better, worse = (b, a) if measure.is_good else (a, b)
     figures: dict[str, Any] = {"a": float(a.mean()), "b": float(b.mean())}
     if not _are_enough(a, strata):
         return figures

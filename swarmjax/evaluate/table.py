@@ -43,13 +43,15 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
     episodes = sum(cell["episodes"] for cell in cells)
     acting = ", each robot's most likely action" if result["action"] == "mean" else ""
     _say(console, f"{who} on {where}, {episodes:,} episodes{acting}")
+    own = {name: Measure(**each) for name, each in result.get("own_measures", {}).items()}
+    about = {**MEASURES, **own}
     if "compared" in result:
         for cell in cells:
-            _show_comparison(console, cell)
+            _show_comparison(console, cell, about)
         if result["pooled"] is not None:
-            _show_comparison(console, {"cell": "all", **result["pooled"]})
+            _show_comparison(console, {"cell": "all", **result["pooled"]}, about)
     elif len(cells) == 1:
-        _show_cell(console, cells[0])
+        _show_cell(console, cells[0], about)
     else:
         _show_cells(console, result)
     for cell in cells:
@@ -77,11 +79,11 @@ def _table(console: Console, *heads: str) -> Table:
     return table
 
 
-def _show_cell(console: Console, cell: Mapping[str, Any]) -> None:
+def _show_cell(console: Console, cell: Mapping[str, Any], about: Mapping[str, Measure]) -> None:
     """Prints one cell: a row for each measure."""
     table = _table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
     for name, figures in cell["measures"].items():
-        measure = MEASURES[name]
+        measure = about[name]
         mean, iqm, worst = (_number(figures[key], measure) for key in ("mean", "iqm", "cvar"))
         ends = [_interval(figures[f"{key}_interval"], measure) for key in ("mean", "iqm")]
         table.add_row(_label(measure), mean, ends[0], iqm, ends[1], worst)
@@ -99,17 +101,21 @@ def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
 
 
 def _shown(figures: Mapping[str, Any], name: str, key: str, with_ends: bool) -> str:
+    if name not in figures:  # path efficiency, where targets move
+        return "-"
     shown = _number(figures[name][key], MEASURES[name])
     interval = figures[name][f"{key}_interval"] if with_ends else None
     return shown if interval is None else f"{shown} {_interval(interval, MEASURES[name])}"
 
 
-def _show_comparison(console: Console, cell: Mapping[str, Any]) -> None:
+def _show_comparison(
+    console: Console, cell: Mapping[str, Any], about: Mapping[str, Measure]
+) -> None:
     """Prints one cell of a comparison: a row for each measure."""
     heads = ("a", "b", "b - a", "95 %", "b better, %", "95 %")
     table = _table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
     for name, figures in cell["measures"].items():
-        measure, share = MEASURES[name], MEASURES["targets_reached"]
+        measure, share = about[name], MEASURES["targets_reached"]
         row = [_number(figures["a"], measure), _number(figures["b"], measure)]
         if "difference" in figures:
             row += [
@@ -145,7 +151,7 @@ def levels(entrants: Sequence[Entrant], trials: Sequence[Trial]) -> str:
       entrants: The policies, in the order of the trials' rows.
       trials: Their results, one for each cell.
     """
-    names, text = [name for name in MEASURES if name in trials[0].measures], io.StringIO()
+    names, text = [*trials[0].measures], io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(["cell", "episode", "policy", "unreachable", *names])
     for trial in trials:

@@ -21,7 +21,7 @@ from swarmjax.task import stage_files
 from swarmjax.task.config import TaskConfig, describe
 
 # Keys of the task that a judge needs too; rewards and step limit matter only in training.
-_TASK = ("control_step", "target_radius", "arrival", "observations")
+_TASK = ("control_step", "target_radius", "goal", "target_speed", "arrival", "observations")
 # Keys of the robot that a policy file holds in `meta.sensors`.
 _SENSORS = {
     "poses": "sensor_poses",

@@ -4,24 +4,26 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import islice
 from multiprocessing import get_context, parent_process
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
-from swarmjax import policy_file, provenance
+from swarmjax import extension, policy_file, provenance
 from swarmjax.config import build, files
 from swarmjax.evaluate import engine_c, measures, shortest_path
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate.cells import Cell, split
 from swarmjax.evaluate.config import STEPS, EvaluateConfig
-from swarmjax.evaluate.measures import Outcome
+from swarmjax.evaluate.measures import Measure, Outcome
 from swarmjax.policy import Policy
 from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task.goals import load as goals
 from swarmjax.task.level import Level
 
 BATCH = 64  # arenas that share NumPy's cost per call; larger batches gain little
@@ -41,11 +43,13 @@ class Trial(NamedTuple):
       cell: Cell with E levels.
       shortest: [E, R] lengths of the shortest paths, m; inf if a target cannot be reached.
       measures: [P, E] of each measure that the engine computes.
+      own: The goal's own measures.
     """
 
     cell: Cell
     shortest: np.ndarray
     measures: dict[str, np.ndarray]
+    own: Mapping[str, Measure] = MappingProxyType({})
 
 
 class _Job(NamedTuple):
@@ -131,10 +135,13 @@ def _try(
     config: EvaluateConfig, cell: Cell, outcomes: Sequence[Outcome], shortest: np.ndarray
 ) -> Trial:
     """Builds a trial from the policies' outcomes on a cell."""
-    second = config.task.control_step
-    rows = [measures.per_level(each, second, config.step_limit, shortest) for each in outcomes]
+    goal = goals.load(config.task, config.robot, extension.load(config.extensions).goals)
+    # The shortest way is that to a target that stays.
+    known = None if goal.moves else shortest
+    second, steps, own = config.task.control_step, config.step_limit, goal.measures
+    rows = [measures.per_level(each, second, steps, known, own) for each in outcomes]
     tables = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-    return Trial(cell, shortest, tables)
+    return Trial(cell, shortest, tables, own)
 
 
 def _by_mjx(

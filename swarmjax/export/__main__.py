@@ -144,6 +144,12 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
             f"format is webots, whose controller drives an e-puck, but the policy's robot has "
             f"{len(poses)} other sensors: give format=c or onnx, and your own controller."
         )
+    goal = meta["task"].get("goal", "navigate")
+    if goal != "navigate" or meta["task"].get("target_speed"):
+        raise PolicyError(
+            f"format is webots, whose world has targets that stay, but the policy's goal is {goal} "
+            "with targets that move: give format=c or onnx, and your own controller."
+        )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:

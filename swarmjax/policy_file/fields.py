@@ -137,6 +137,7 @@ _OPTIONAL = {  # fields that may be missing, with what they hold
         "memory.kind": _one_of("gru"),
         "memory.size": _whole(1, 1024),
     },
+    "task.goal": {"task.goal": _NAMED},
     "task.step_limit": {"task.step_limit": _whole(1)},
     "observation.neighbours": {
         "observation.neighbours": _Rule(

@@ -24,6 +24,7 @@ from swarmjax.replay.record import Recording, ReplayEpisode
 LENGTH = 2e-4  # m; positions are off by at most half of it
 ANGLE = 1e-3  # rad; headings are off by at most half of it
 RAY = 5e-4  # m; a ray is shown with the middle of its interval
+MEASURE = 1e-3  # quantum of a goal's own measures
 REWARD = 1e-4  # quantum of each reward term, summed since the start
 # Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
@@ -55,7 +56,7 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
                 _describe_run(recording)
                 | {"series": [[name, columns[name].shape[1], packed[name][1]] for name in packed]}
             )
-    quanta = {"length": LENGTH, "angle": ANGLE, "ray": RAY, "reward": REWARD}
+    quanta = {"length": LENGTH, "angle": ANGLE, "ray": RAY, "reward": REWARD, "measure": MEASURE}
     header = {**about, "quanta": quanta, "dark": dark(reach), "episodes": listed}
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     return zlib.compress(b"".join([len(text).to_bytes(4, "little"), text, *tables]), 9)
@@ -120,8 +121,12 @@ def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
         "contacts": recording.contacts,
     }
     latched = (recording.arrival > 0) & (np.arange(rows)[:, None] >= recording.arrival)
+    if (recording.target != recording.target[0]).any():
+        series["target"] = recording.target / LENGTH
     if (recording.arrived != latched).any():  # a robot left again, which `arrival` cannot show
         series["arrived"] = recording.arrived.astype(int)
+    if recording.measured.size:
+        series["measured"] = recording.measured / MEASURE
     for name, term in recording.reward.items():
         series[f"reward.{name}"] = np.cumsum(term, axis=0) / REWARD
     return {name: np.rint(each).reshape(rows, -1) for name, each in series.items()}
@@ -137,10 +142,10 @@ def _describe(episode: ReplayEpisode) -> dict[str, Any]:
         "label": episode.label,
         "level": episode.level,
         "side": round(scene.side, 5),
-        "target": scene.target.round(5).tolist(),
+        "target": episode.runs[0].target[0].round(5).tolist(),
         "box": scene.box.round(5).tolist(),
         "sensor": sensor.round(5).tolist(),
-        "colours": colours(len(scene.target)),
+        "colours": colours(episode.runs[0].pose.shape[1]),
     }
 
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 
-from swarmjax import provenance
+from swarmjax import extension, provenance
 from swarmjax.pages import builder
 from swarmjax.policy import Policy
 from swarmjax.replay import pack
 from swarmjax.replay.config import ReplayConfig
 from swarmjax.replay.record import ReplayEpisode
 from swarmjax.sim import gaps
+from swarmjax.task.goals import load as goals
 
 _SOFTWARE = ("swarmjax", "mujoco", "numpy")  # what computed the episodes
 _SCRIPTS = ("replay/replay_data.js", "replay/replay_draw.js", "replay/replay.js")
@@ -32,6 +33,7 @@ def page(
       HTML. Text about files and settings is either escaped or inside the packed data.
     """
     task = settings.task
+    goal = goals.load(task, settings.robot, extension.load(settings.extensions).goals)
     header = {
         "policies": list(settings.policies),
         "about": f"{_levels(settings)}, {settings.robot.body} robots, simulated by MuJoCo C",
@@ -43,6 +45,7 @@ def page(
         "range": settings.robot.sensor_range,
         "targetRadius": task.target_radius,
         "arrival": task.arrival,
+        "measures": [[each.label, each.unit] for each in goal.measures.values()],
     }
     packed = pack.pack(header, episodes, settings.robot.sensor_range)
     return fill(f"Replay of {' and '.join(settings.policies)} on {_levels(settings)}", packed)

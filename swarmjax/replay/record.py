@@ -15,7 +15,7 @@ from swarmjax.evaluate import contacts, engine_c
 from swarmjax.evaluate.engine_c import Arenas, Judge
 from swarmjax.policy import Policy
 from swarmjax.sim import infrared
-from swarmjax.task import arrival, reward
+from swarmjax.task import observation, reward
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 
@@ -26,13 +26,11 @@ class ReplayScene:
 
     Attributes:
       side: Side of the arena, m.
-      target: [R, 2] x (m), y (m).
       box: [B, 5] x (m), y (m), yaw (rad), half edges (m) of the boxes that form the obstacles.
       sensor: [R, K, 4] origin (m) and unit direction of each infrared ray, in the robot's frame.
     """
 
     side: float
-    target: np.ndarray
     box: np.ndarray
     sensor: np.ndarray
 
@@ -43,20 +41,26 @@ class Frames:
 
     Attributes:
       pose: [N, A, R, 3] x (m), y (m), yaw (rad); recordings have no axis A.
+      target: [N, A, R, 2] x (m), y (m).
       ray: [N, A, R, K] length of each infrared ray, m; at most the range of the electronics.
       distance: [N, A, R] to the target, m.
       touching: [N, A, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
       arrived: [N, A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         within its target.
       contacts: [N, A, R, 3] contacts so far of each kind.
+      earns: [N, A, R] whether the robot earns the reward `arrival`.
+      measured: [N, A, K] the goal's own measures so far.
     """
 
     pose: np.ndarray
+    target: np.ndarray
     ray: np.ndarray
     distance: np.ndarray
     touching: np.ndarray
     arrived: np.ndarray
     contacts: np.ndarray
+    earns: np.ndarray
+    measured: np.ndarray
 
     def take(self, rows: Any) -> "Frames":
         """Indexes all fields."""
@@ -129,7 +133,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
         memory, action = engine_c.act(judge, memory, arenas)
         arenas = engine_c.step(judge, arenas, action)
         frames.append(_look(judge, arenas))
-        over |= arenas.outcome.arrived.all(axis=-1)
+        over |= engine_c.is_over(judge, arenas.outcome)
     every = Frames(**{name: np.stack([each[name] for each in frames]) for name in frames[0]})
     return [
         _cut(
@@ -150,11 +154,14 @@ def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
     )
     return {
         "pose": arenas.pose,
+        "target": arenas.target,
         "ray": sight.ray,
         "distance": sight.distance,
         "touching": contacts.touching(judge, arenas.data),
         "arrived": arenas.outcome.arrived,
         "contacts": arenas.outcome.contacts,
+        "earns": arenas.earns,
+        "measured": arenas.outcome.measured,
     }
 
 
@@ -166,19 +173,21 @@ def _cut(
     earning: RewardConfig,
 ) -> Recording:
     """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
-    task, over = judge.config.task, frames.arrived.all(axis=-1)
+    goal = judge.goal
+    over = goal.is_over(frames.arrived, np.ones_like(frames.arrived))
     frames = frames.take(np.s_[: over.argmax() + 1 if over.any() else None])
     before = frames.arrived[:-1]
-    active, present = arrival.drives(task.arrival, before), np.ones_like(before)
+    # A step is paid for the way to the target that the robot had, even if it gets another then.
+    distance, _ = observation.to_target(frames.pose[1:], frames.target[:-1], np)
     steps = reward.Step(
         distance_before=frames.distance[:-1],
-        distance=frames.distance[1:],
+        distance=distance,
         infrared=frames.ray[1:],
         sensor_range=judge.config.robot.sensor_range,
-        arrives=arrival.arrives(task.arrival, before, frames.arrived[1:], present),
+        arrives=frames.earns[1:],
         contact_begins=np.diff(frames.contacts, axis=0),
         touching=frames.touching[1:],
-        outside=~before,
+        outside=goal.is_under_way(before),
     )
     if earning.path_progress:
         path = _measure_paths(level, frames.pose, judge.config.robot.hull_radius)
@@ -189,7 +198,7 @@ def _cut(
         **vars(frames) | {"ray": np.minimum(frames.ray, judge.config.robot.sensor_range)},
         scene=scene,
         reward={
-            name: np.concatenate([none, np.where(active, term, 0.0)])
+            name: np.concatenate([none, np.where(goal.drives(before), term, 0.0)])
             for name, term in earned.items()
         },
         arrival=_since(frames.arrived),
@@ -224,7 +233,6 @@ def _scene(level: Level, mount: infrared.Mount) -> ReplayScene:
     origin, toward = infrared.rays(at_origin, np, mount)
     return ReplayScene(
         side=float(level.side),
-        target=level.target.astype(float),
         box=level.obstacle[level.obstacle_present].astype(float),
         sensor=np.concatenate([origin, toward], axis=-1),
     )

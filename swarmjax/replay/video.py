@@ -119,6 +119,8 @@ class _Shot:
         self.recording = recording
         self.model = build(settings, recording).compile()
         self.data = mujoco.MjData(self.model)
+        robots = recording.pose.shape[1]
+        self.targets = [self.model.geom(f"target{i}").id for i in range(robots)]
         self.renderer = mujoco.Renderer(self.model, HEIGHT, width)
         self.camera = mujoco.MjvCamera()
         self.camera.azimuth, self.camera.elevation = 90.0, -math.degrees(ELEVATION)
@@ -131,6 +133,7 @@ class _Shot:
         self.data.mocap_pos[:, :2] = pose[:, :2]
         self.data.mocap_quat[:, 0] = np.cos(0.5 * pose[:, 2])
         self.data.mocap_quat[:, 3] = np.sin(0.5 * pose[:, 2])
+        self.model.geom_pos[self.targets, :2] = self.recording.target[row]
         mujoco.mj_forward(self.model, self.data)
         self.renderer.update_scene(self.data, self.camera)
         return self.renderer.render()
@@ -152,9 +155,10 @@ def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
     _add_fixtures(spec, recording)
     names = pack.colours(recording.pose.shape[1])  # #rrggbb
     colours = [[*(part / 255.0 for part in bytes.fromhex(name[1:])), 1.0] for name in names]
-    for (x, y), colour in zip(recording.scene.target, colours, strict=True):
+    for i, ((x, y), colour) in enumerate(zip(recording.target[0], colours, strict=True)):
         size = [settings.task.target_radius, _FLAT, 0.0]
-        _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
+        disc = _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
+        disc.name = f"target{i}"
     for colour in colours:
         _add_robot(spec, settings.robot.hull_radius, colour)
     return spec

@@ -15,6 +15,7 @@ from swarmjax.run import recipes
 from swarmjax.run.directory import CONFIG, MAY_CHANGE
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import pieces, stage_files
+from swarmjax.task.goals import load as goals
 
 AUTO = "auto"  # `resume` accepts this word in place of a directory
 
@@ -156,6 +157,7 @@ def settle[C: TrainConfig](settings: C) -> C:
     used = pieces.choose(found, settings.task, settings.stage)
     network = resolve(settings.algo, found.networks)
     check_mode(settings.curriculum.mode, found.curricula)
+    goals.load(settings.task, settings.robot, found.goals)  # raises if there is no such goal
     if settings.extensions is None:
         return settings
     drawn = {stage.level for stage in settings.stage}
@@ -165,6 +167,7 @@ def settle[C: TrainConfig](settings: C) -> C:
         levels=tuple(each for each in found.levels if each.name in drawn),
         networks=tuple(each for each in found.networks if each.name == network),
         curricula=tuple(each for each in found.curricula if each.name == settings.curriculum.mode),
+        goals=tuple(each for each in found.goals if each.name == settings.task.goal),
     )
     return replace(
         settings,

@@ -19,7 +19,7 @@ POLICY = "policy.npz"
 
 
 _LOCAL = ("run", "resume", "init_from")
-_TASK = ("control_step", "target_radius", "arrival", "step_limit")
+_TASK = ("control_step", "target_radius", "goal", "target_speed", "arrival", "step_limit")
 
 
 def policy_arrays(leaves: Leaves) -> dict[str, np.ndarray]:

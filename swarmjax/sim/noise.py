@@ -16,7 +16,7 @@ Array = Any
 class Stream(enum.IntEnum):
     """Purpose of a random number; values must never change, so that old levels still replay.
 
-    Streams up to `WAY` are drawn once per episode, at clock 0; the others at each
+    Streams up to `TARGET_COURSE` are drawn once per episode, at clock 0; the others at each
     control step.
     """
 
@@ -37,11 +37,13 @@ class Stream(enum.IntEnum):
     ARENA_SIDE = 18
     LAYOUT = 19
     WAY = 20
+    TARGET_COURSE = 21
     INFRARED = 32
     SPEED_NOISE = 33
     TARGET_DISTANCE = 36
     TARGET_BEARING = 37
     ACTION = 38
+    NEXT_TARGET = 39
 
 
 def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:

@@ -1,5 +1,5 @@
 """One arena as an environment: levels, observations, rewards and the robots' electronics.
 
 The package imports `sim`. The package has no learning code, no curriculum and no batch of arenas.
-Its whole interface is `env.load`, `env.reset` and `env.step`. Start reading at `env.step`.
+Its whole interface is `world.load`, `env.reset` and `env.step`. Start reading at `env.step`.
 """

@@ -1,17 +1,23 @@
 """Settings of the task and its reward."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, inherit, setting, show
-from swarmjax.config.section import MAX_COUNT, ByName
+from swarmjax.config.section import MAX_COUNT, ByName, check_options
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.realism_config import RealismConfig
-from swarmjax.task.arrival import Arrival
 
 # The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
+# The goal that reads an option.
+_READ_BY: dict[str, tuple[str, Sequence[str]]] = dict.fromkeys(
+    ("arrival", "target_speed"), ("goal", ("navigate",))
+)
+
+Arrival = Literal["latch", "hold"]
 
 
 def _weight(default: float, meaning: str) -> Any:
@@ -31,7 +37,9 @@ class RewardConfig(Section):
         0.0, "per control step before arrival with an object in infrared range"
     )
     arrival: float = _weight(
-        0.0, "once, on arrival; with arrival=hold, when all robots have arrived"
+        0.0,
+        "once, on arrival; with arrival=hold and goal=gather, when all robots have arrived; "
+        "lifelong: at each target; cover: in each step that sees new floor",
     )
     contact: float = _weight(-0.2, "per contact event of any kind")
     touching: float = _weight(0.0, "per control step in which the robot touches something")
@@ -54,10 +62,19 @@ class TaskConfig(Section):
         above=0.0,
         high=0.1,
     )
+    goal: str = setting(
+        "navigate",
+        "navigate: each robot drives to its own target; lifelong: to one target after another; "
+        "gather: all robots come together; cover: they see the whole floor; or the name of an "
+        "extension's goal",
+    )
+    target_speed: float = setting(
+        0.0, "speed of the targets, which bounce off walls, m/s; 0: they stay [navigate]", 0.0, 0.2
+    )
     arrival: Arrival = setting(
         "latch",
         "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
-        "and the episode is complete when all are within their targets at once",
+        "and the episode is complete when all are within their targets at once [navigate]",
     )
     encoding: Literal["auto", "metric", "webots"] = setting(
         "auto",
@@ -69,6 +86,14 @@ class TaskConfig(Section):
     )
     reward: RewardConfig = field(default_factory=RewardConfig)
 
+    def _check(self) -> None:
+        check_options(self, _READ_BY)
+        if self.reward.path_progress and (self.goal != "navigate" or self.target_speed):
+            raise ConfigError(
+                f"reward.path_progress is {show(self.reward.path_progress)}, but targets move: "
+                "give 0, or goal=navigate with target_speed=0."
+            )
+
 
 def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> str:
     """Returns part of a sentence that describes the robot, its sensors and the task."""
@@ -78,9 +103,16 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
     return (
         f"hull {robot.hull_radius:g} m{rubs}, infrared{sensors} to {robot.sensor_range:g} m, at "
         f"most {robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
-        f"{task.control_step:g} s, arrival {task.arrival}, realism "
+        f"{task.control_step:g} s, {_describe_goal(task)}, realism "
         f"{inherit.preset_of('realism', realism)}"
     )
+
+
+def _describe_goal(task: TaskConfig) -> str:
+    if task.goal != "navigate":
+        return f"goal {task.goal}"
+    moves = f", targets that move at {task.target_speed:g} m/s" if task.target_speed else ""
+    return f"arrival {task.arrival}{moves}"
 
 
 def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, steps: int) -> None:

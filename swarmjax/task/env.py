@@ -4,8 +4,7 @@ Use `vmap` to run many arenas. Arenas do not reset themselves here: a step repor
 the rollout decides whether to reset.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import chex
@@ -14,64 +13,24 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.config import ConfigError
-from swarmjax.extension import NONE, Extensions, LevelDrawing, RewardTerm
-from swarmjax.sim import dispatch, infrared, model, physics
+from swarmjax.sim import dispatch, infrared, physics
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
-from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
-from swarmjax.sim.realism_config import RealismConfig
+from swarmjax.task import electronics as task_electronics
 from swarmjax.task import (
-    arrival,
     extended,
     geodesic,
     observation,
-    pieces,
     reward,
-    room,
     surroundings,
 )
-from swarmjax.task import electronics as task_electronics
 from swarmjax.task import factors as task_factors
-from swarmjax.task import stage as task_stage
-from swarmjax.task.config import TaskConfig
-from swarmjax.task.electronics import Electronics, Memory, Sight
+from swarmjax.task.electronics import Memory, Sight
 from swarmjax.task.episode import Episode
 from swarmjax.task.factors import Factors
-from swarmjax.task.level import Level, Spacing
-from swarmjax.task.stage_config import StageConfig, make_room
-
-
-@dataclass(frozen=True, eq=False)
-class World:
-    """Everything that is fixed in the compiled environment.
-
-    Attributes:
-      robot: settings of the robot.
-      task: settings of the task.
-      realism: sensor models, and factors drawn for each episode.
-      physics: the compiled physics.
-      spacing: sizes that levels are drawn with.
-      drive: the robot's drive.
-      electronics: the motors and sensors between policy and arena.
-      terms: reward terms of an extension, with their weights.
-      drawings: level drawings of an extension.
-    """
-
-    robot: RobotConfig
-    task: TaskConfig
-    realism: RealismConfig
-    physics: physics.Physics
-    spacing: Spacing
-    drive: sim_drive.Drive
-    electronics: Electronics
-    terms: tuple[tuple[RewardTerm, float], ...] = ()
-    drawings: tuple[LevelDrawing, ...] = ()
-
-    @property
-    def observation_size(self) -> int:
-        """Size of an observation, O."""
-        return self.electronics.layout.size
+from swarmjax.task.goals.goal import Turn
+from swarmjax.task.level import Level
+from swarmjax.task.world import World
 
 
 @struct.dataclass
@@ -80,11 +39,12 @@ class EnvState:
 
     Attributes:
       sim: a `PhysicsState` before and after a rollout; during a rollout, the engine's own data.
-      level: the level that the episode started from.
+      level: the level that the episode started from, with the targets of now.
       factors: realism factors of the episode, drawn from the level's seed.
       memory: state of the robots' electronics.
       observation: [R, O] input of the policy.
       clock: [] control steps since the start, int32.
+      goal: state of the goal.
       arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
         its target now.
       distance: [R] distance to the target, m.
@@ -99,6 +59,7 @@ class EnvState:
     memory: Memory
     observation: Array
     clock: Array
+    goal: Any
     arrived: Array
     distance: Array
     apart: Array
@@ -119,6 +80,7 @@ class TimeStep(NamedTuple):
         arrived before) and the physics is sound.
       done: [] whether the arena's episode is over.
       sound: [] whether physics, rewards, distances and observations are all finite.
+      measured: [K] the goal's own measures so far.
     """
 
     observation: Array
@@ -128,75 +90,7 @@ class TimeStep(NamedTuple):
     valid: Array
     done: Array
     sound: Array
-
-
-def load(
-    stages: Sequence[StageConfig],
-    robot: RobotConfig | None = None,
-    task: TaskConfig | None = None,
-    realism: RealismConfig | None = None,
-    sim: SimConfig | None = None,
-    *,
-    arenas: int = 1,
-    extensions: Extensions = NONE,
-) -> World:
-    """Builds the world that `reset` and `step` run in, and puts the model on the device.
-
-    Args:
-      stages: stages to run; the model is compiled for their largest obstacle.
-      robot: the robot. Here and in the settings below, None stands for the default.
-      task: the task.
-      realism: sensor models, and factors drawn for each episode.
-      sim: physics engine, and largest numbers of robots and obstacles.
-      arenas: largest number of arenas stepped together; only Warp uses it.
-      extensions: extension pieces; `task` names the ones to use.
-
-    Raises:
-      ConfigError: Warp is selected but not installed, a solver cannot run here, or a piece of an
-        extension is missing or returns a wrong shape.
-    """
-    robot, task = robot or RobotConfig(), task or TaskConfig()
-    realism, sim = realism or RealismConfig(), make_room(sim or SimConfig(), stages)
-    if jax.config.jax_enable_x64:
-        raise ConfigError(
-            "jax_enable_x64 is on, but arenas and learners compute in 32 bits: switch it off, as "
-            "in JAX_ENABLE_X64=0."
-        )
-    chosen = pieces.choose(extensions, task, stages)
-    extended.check(chosen, robot, robots=sim.robots, obstacles=sim.obstacles)
-    size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
-    spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
-    room.check(stages, spacing, chosen.drawings)
-    return World(
-        robot=robot,
-        task=task,
-        realism=realism,
-        physics=_load_physics(size, robot, task, realism, sim, arenas),
-        spacing=spacing,
-        drive=sim_drive.from_config(robot),
-        electronics=task_electronics.load(task, realism, own=chosen.observations, robot=robot),
-        terms=chosen.terms,
-        drawings=chosen.drawings,
-    )
-
-
-def _load_physics(
-    size: model.ArenaSize,
-    robot: RobotConfig,
-    task: TaskConfig,
-    realism: RealismConfig,
-    sim: SimConfig,
-    arenas: int,
-) -> physics.Physics:
-    """Compiles the model of one arena, and loads the engine that steps the arena."""
-    largest = task_factors.largest(robot, realism)
-    substeps, choice = physics_substeps(robot, sim.substeps), dispatch.choose(sim, largest)
-    spec = model.build(largest, size, task.control_step / substeps, fixtures="world")
-    spec.option.iterations, spec.option.ls_iterations = choice.iterations, choice.ls_iterations
-    compiled = spec.compile()
-    ids = model.ids(compiled, size)
-    engine = dispatch.load_engine(compiled, ids, robot, choice, arenas)
-    return physics.Physics(engine, compiled, ids, robot, substeps)
+    measured: Array
 
 
 def reset(world: World, level: Level) -> EnvState:
@@ -213,6 +107,8 @@ def reset(world: World, level: Level) -> EnvState:
     sensors = len(world.robot.sensor_poses)
     factors = task_factors.draw(level.seed, world.realism, robots, obstacles, jnp, sensors)
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
+    goal, target = world.goal.begin(level)
+    level = level._replace(target=target)
     sight = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
@@ -223,6 +119,7 @@ def reset(world: World, level: Level) -> EnvState:
         memory=memory,
         observation=seen,
         clock=clock,
+        goal=goal,
         arrived=arrived,
         distance=sight.distance,
         apart=jnp.full((robots, len(sim_gaps.KINDS)), sim_gaps.CONTACT_PAUSE),
@@ -273,13 +170,13 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     """
     chex.assert_shape(action, (state.level.present.shape[0], sim_drive.ACTION_SIZE))
     level = state.level
-    active = level.present & arrival.drives(world.task.arrival, state.arrived)
+    active = level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
     sight = _look(world, pose, level, state.factors)
-    rule, within = world.task.arrival, active & (sight.distance <= world.task.target_radius)
-    arrived = arrival.arrived(rule, state.arrived, within)
-    arrives = arrival.arrives(rule, state.arrived, arrived, level.present)
+    to_old_target = sight.distance
+    turn, level, sight = _turn(world, state, sight, pose, clock)
+    arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
@@ -288,15 +185,19 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     after = replace(
         state,
         sim=data,
+        level=level,
         memory=memory,
         clock=clock,
+        goal=turn.state,
         arrived=arrived,
         distance=sight.distance,
         apart=apart,
         path=_measure_path(world, level, state.path, pose),
     )
     begun = begins & active[:, None]
-    earned = _reward_step(world, state, after, sight, arrives, begun, pose, action)
+    earns = ends if turn.earns is None else turn.earns
+    earned = _reward_step(world, state, after, sight, earns, begun, pose, action)
+    earned = earned._replace(distance=to_old_target)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
@@ -304,17 +205,33 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     gained = jnp.where(valid, gained, 0.0)
     # Learning skips the step of a broken arena, so the critic need not see it either.
     seen = jnp.where(sound, seen, state.observation)
-    episode = _tally(state.episode, gained, begins, earned, valid & ~state.arrived)
+    episode = _tally(
+        state.episode, gained, begins, earned, valid & world.goal.is_under_way(state.arrived)
+    )
     timeout = clock >= world.task.step_limit
     return replace(after, observation=seen, episode=episode), TimeStep(
         observation=seen,
         reward=gained,
-        terminated=arrives,
-        truncated=active & ~arrives & (timeout | ~sound),
+        terminated=ends,
+        truncated=active & ~ends & (timeout | ~sound),
         valid=valid,
-        done=arrival.complete(arrived, level.present) | timeout | ~sound,
+        done=world.goal.is_over(arrived, level.present) | timeout | ~sound,
         sound=sound,
+        measured=world.goal.measured(turn),
     )
+
+
+def _turn(
+    world: World, state: EnvState, sight: Sight, pose: Array, clock: Array
+) -> tuple[Turn, Level, Sight]:
+    """Asks the goal; returns its answer, the level with the new targets, and the sight of them."""
+    view = task_electronics.view(sight, pose, state.level, state.arrived, clock)
+    turn = world.goal.advance(state.goal, state.level, view)
+    if not world.goal.moves:
+        return turn, state.level, sight
+    distance, bearing = observation.to_target(pose, turn.target, jnp)
+    sight = sight._replace(distance=distance, bearing=bearing)
+    return turn, state.level._replace(target=turn.target), sight
 
 
 def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:
@@ -344,7 +261,7 @@ def _reward_step(
         arrives=arrives,
         contact_begins=begins,
         touching=after.apart == 0.0,
-        outside=~before.arrived,
+        outside=world.goal.is_under_way(before.arrived),
     )
     if before.path is not None and after.path is not None:
         step = step._replace(path_before=before.path.distance, path=after.path.distance)

@@ -15,9 +15,10 @@ from swarmjax.ppo.ppo import PPO
 from swarmjax.provenance import cores
 from swarmjax.shards import Shards
 from swarmjax.sim import drive
-from swarmjax.task import env, surroundings
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import World
+from swarmjax.task import surroundings
+from swarmjax.task import world as task_world
+from swarmjax.task.world import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.rollout import Program
@@ -94,7 +95,7 @@ def shards(config: ProgramConfig) -> Shards:
 
 def load_world(config: ProgramConfig) -> World:
     """Builds the environment, with memory for all arenas that are stepped together."""
-    return env.load(
+    return task_world.load(
         config.stage,
         config.robot,
         config.task,

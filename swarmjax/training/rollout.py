@@ -22,9 +22,10 @@ from swarmjax.shards import ALONE, Shards
 from swarmjax.sim import drive, physics
 from swarmjax.task import env, extended, level
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, World
+from swarmjax.task.env import EnvState
 from swarmjax.task.episode import Ended
 from swarmjax.task.stage import Stage
+from swarmjax.task.world import World
 from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 

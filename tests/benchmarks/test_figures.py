@@ -20,7 +20,8 @@ from swarmjax.run.run import Run
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
 from swarmjax.task import env
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
+from swarmjax.task.world import World
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.rollout import Program
@@ -135,7 +136,7 @@ def test_a_call_of_the_environment_makes_the_steps_that_are_counted(
         """Only counts the step in the clock."""
         nothing, no = jnp.zeros(ROBOTS), jnp.zeros(ROBOTS, bool)
         done = jnp.zeros((), bool)
-        came = TimeStep(state.observation, nothing, no, no, no, done=done, sound=~done)
+        came = TimeStep(state.observation, nothing, no, no, no, done, ~done, jnp.zeros(0))
         return replace(state, clock=state.clock + 1), came
 
     monkeypatch.setattr(env, "step", step)

@@ -23,11 +23,12 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.networks import Normalizer, Sizes
 from swarmjax.ppo.ppo import LearnerState
 from swarmjax.sim.config import RobotConfig, SimConfig
-from swarmjax.task import env, level, observation
+from swarmjax.task import level, observation
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import World
+from swarmjax.task import world as task_world
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 
 STAGES = (
     StageConfig(name="s1", robots=2, side=0.5),
@@ -45,7 +46,7 @@ Run = Callable[[LearnerState, Level], Outcomes]
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return env.load(STAGES, sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2))
+    return task_world.load(STAGES, sim=SimConfig(impl="jax", max_robots=3, max_obstacles=2))
 
 
 @pytest.fixture(scope="module")

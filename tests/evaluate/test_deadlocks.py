@@ -23,6 +23,7 @@ def _level(arrived: list[bool], still: list[int]) -> Outcome:
         path=none,
         still=np.array([still]),
         anchor=np.zeros((1, robots, 2)),
+        measured=np.zeros((1, 0)),
     )
 
 

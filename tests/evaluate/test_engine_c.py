@@ -30,10 +30,11 @@ from swarmjax.sim.config import RobotConfig, SimConfig
 from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import electronics, env, observation
 from swarmjax.task.config import TaskConfig
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.task.stage_files import load_levels
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 
 

@@ -26,6 +26,7 @@ def _outcome() -> Outcome:
         path=np.array([[0.5, 1.0], [0.25, 3.0], [0.0, 2.0]]),
         still=np.array([[30, 0], [0, 60], [60, 49]]),
         anchor=np.zeros((3, 2, 2)),
+        measured=np.zeros((3, 0)),
     )
 
 

@@ -99,6 +99,8 @@ def test_the_policy_says_what_it_was_trained_with(tmp_path: Path) -> None:
     assert said["task"] == {
         "control_step": 0.064,
         "target_radius": 0.05,
+        "goal": "navigate",
+        "target_speed": 0.0,
         "arrival": "latch",
         "step_limit": 500,
         "observations": [],
@@ -154,6 +156,16 @@ def test_export_refuses(
         assert sentence in _refusal(monkeypatch, capsys, *words)
     assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", "file"}
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_webots_has_no_targets_that_move(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "policy.npz"
+    saved(path, task=policies.meta()["task"] | {"goal": "gather"})
+    assert "the policy's goal is gather with targets that move: give format=c or onnx" in _refusal(
+        monkeypatch, capsys, f"policy={path}", "format=webots", f"out={tmp_path / 'a'}"
+    )
 
 
 def test_export_says_what_onnx_needs(

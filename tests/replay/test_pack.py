@@ -88,7 +88,7 @@ def test_recordings_come_back_to_the_quantum(tmp_path):
         _check(recording, series)
         assert episode["runs"][0]["arrival"] == recording.arrival.tolist()
         # The header rounds to 1e-5.
-        np.testing.assert_allclose(episode["target"], recording.scene.target, atol=5.1e-6)
+        np.testing.assert_allclose(episode["target"], recording.target[0], atol=5.1e-6)
         np.testing.assert_allclose(episode["sensor"], recording.scene.sensor, atol=5.1e-6)
 
 

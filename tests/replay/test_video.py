@@ -59,7 +59,7 @@ def test_things_have_their_true_sizes():
     kinds, sizes, places = model.geom_type, model.geom_size, data.geom_xpos
     cylinder, box = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX
     discs = np.flatnonzero((kinds == cylinder) & np.isclose(sizes[:, 0], 0.05))
-    np.testing.assert_allclose(places[discs, :2], run.scene.target)
+    np.testing.assert_allclose(places[discs, :2], run.target[0])
     hulls = np.flatnonzero((kinds == cylinder) & np.isclose(sizes[:, 0], 0.037))
     assert len(hulls) == 3
     np.testing.assert_allclose(sizes[hulls, 1], 0.5 * 0.045)  # the hull is 45 mm high
@@ -104,7 +104,7 @@ except ConfigError:
     sys.exit(77)
 video.HEIGHT, video.HOLD = 240, 0.1
 run = replays.wandering(2, 4)
-run.pose[:, :, :2] = run.scene.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
+run.pose[:, :, :2] = run.target[:] = [[-0.3, -0.3], [0.3, 0.3]]
 settings = load_levels(ReplayConfig, ["policy=a", "task.control_step=0.064"])
 out = Path(sys.argv[1])
 video.write(out, settings, [replays.episode(run, run)])

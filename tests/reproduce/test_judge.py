@@ -47,6 +47,7 @@ def test_a_row_is_computed_from_all_episodes(
             path=zero,
             still=zero,
             anchor=np.zeros((2, 2, 2)),
+            measured=np.zeros((2, 0)),
         )
 
     monkeypatch.setattr(engine_c, "simulate", simulate)

@@ -16,9 +16,10 @@ from swarmjax.sim import gaps, infrared, physics
 from swarmjax.task import env, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.task.level import Level
 from swarmjax.task.observation import Readings
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Arena

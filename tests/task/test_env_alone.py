@@ -15,9 +15,10 @@ from swarmjax.sim.config import SimConfig
 from swarmjax.task import env, level
 from swarmjax.task import stage as task_stage
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task import world as task_world
 
 stage = StageConfig(name="two", robots=2, side=0.6)
-world = env.load((stage,), sim=SimConfig(impl="jax", max_robots=2, max_obstacles=0))
+world = task_world.load((stage,), sim=SimConfig(impl="jax", max_robots=2, max_obstacles=0))
 one = task_stage.select(task_stage.stack([stage]), np.intp(0))
 uniform = np.random.default_rng(0).uniform(size=level.uniform_count(world.spacing))
 state = env.reset(world, level.sample(uniform.astype(np.float32), one, world.spacing, jnp))

@@ -18,10 +18,10 @@ from swarmjax.sim import physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env, extended, level, observation
 from swarmjax.task import stage as task_stage
-from swarmjax.task.arrival import Arrival
-from swarmjax.task.config import RewardConfig, TaskConfig
-from swarmjax.task.env import World
+from swarmjax.task import world as task_world
+from swarmjax.task.config import Arrival, RewardConfig, TaskConfig
 from swarmjax.task.stage_config import BUILT_IN, StageConfig
+from swarmjax.task.world import World
 
 RING = StageConfig(name="ring", robots=3, side=1.0, level="ring")
 SIM = SimConfig(impl="jax", max_robots=4, max_obstacles=1)
@@ -30,7 +30,9 @@ _draw = jax.jit(extended.draw, static_argnums=(2, 3))
 
 
 def _world(source: str, stages: tuple[StageConfig, ...] = (RING,), **task: object) -> World:
-    return env.load(stages, task=TaskConfig(**task), sim=SIM, extensions=extension.load(source))
+    return task_world.load(
+        stages, task=TaskConfig(**task), sim=SIM, extensions=extension.load(source)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -147,14 +149,14 @@ def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
         ({"observations": ("x",)}, "task.observations names 'x', "),
         ({"reward": RewardConfig(extra={"x": 1.0})}, "task.reward.extra names 'x', "),
     ):
-        sentence = refusal(partial(env.load, sim=SIM, task=TaskConfig(**task)), stages)
+        sentence = refusal(partial(task_world.load, sim=SIM, task=TaskConfig(**task)), stages)
         assert sentence == (
             f"{key}which is not part of swarmjax: give extensions=FILE, the file that defines it."
         )
 
 
 def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
-    assert refusal(partial(env.load, sim=SIM), (RING,)) == (
+    assert refusal(partial(task_world.load, sim=SIM), (RING,)) == (
         f"stage ring: level is 'ring': give one of {', '.join(BUILT_IN)}, or extensions=FILE, a "
         "file that defines it."
     )

@@ -15,9 +15,11 @@ from swarmjax.sim import physics
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import env, extended, geodesic, level
 from swarmjax.task import stage as task_stage
+from swarmjax.task import world as task_world
 from swarmjax.task.config import RewardConfig, TaskConfig
 from swarmjax.task.level import Level
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 
 HULL = 0.037  # m
@@ -178,7 +180,7 @@ def test_a_step_towards_the_waypoint_shortens_the_path_by_at_least_as_much(drawn
 class Driven(NamedTuple):
     """The first and last state of an episode, and its rewards, which are path progress alone."""
 
-    world: env.World
+    world: World
     began: env.EnvState
     ended: env.EnvState
     rewards: np.ndarray
@@ -190,7 +192,7 @@ def driven() -> Driven:
     weights = RewardConfig(progress=0.0, path_progress=2.0, contact=0.0, step_penalty=0.0)
     stage = StageConfig(name="wall", robots=1, side=1.0, obstacles=1)
     sim = SimConfig(impl="jax", max_robots=1, max_obstacles=1)
-    world = env.load([stage], task=TaskConfig(reward=weights), sim=sim)
+    world = task_world.load([stage], task=TaskConfig(reward=weights), sim=sim)
     state = env.reset(world, _level([-0.3, 0.1], [0.3, 0.1], [WALL]))
     began = dataclasses.replace(state, sim=physics.unpack(world.physics, state.sim))
     actions = np.random.default_rng(2).uniform(-1.0, 1.0, (40, 1, 2)).astype(np.float32)
@@ -220,7 +222,7 @@ def test_an_arena_keeps_the_path_from_where_its_robot_is(driven: Driven) -> None
 
 
 @pytest.mark.slow
-def _look(world: env.World, state: env.EnvState) -> np.ndarray:
+def _look(world: World, state: env.EnvState) -> np.ndarray:
     return np.asarray(jax.jit(partial(env.look_around, world))(state))
 
 
@@ -251,7 +253,7 @@ def test_without_paths_it_sees_the_direction_of_the_target(driven: Driven) -> No
     np.testing.assert_allclose(seen[4:6], seen[:2] / np.hypot(*seen[:2]), atol=ROUND)
 
 
-def test_without_its_weight_no_path_is_kept(tiny_world: env.World) -> None:
+def test_without_its_weight_no_path_is_kept(tiny_world: World) -> None:
     drawn = jax.eval_shape(
         lambda: env.reset(
             tiny_world,

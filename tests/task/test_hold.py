@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 
 from swarmjax.sim import physics
 from swarmjax.task import env, reward
-from swarmjax.task.arrival import Arrival
-from swarmjax.task.config import RewardConfig
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.config import Arrival, RewardConfig
+from swarmjax.task.env import EnvState, TimeStep
+from swarmjax.task.goals import load as goals
+from swarmjax.task.world import World
 
 ROBOTS, OBSTACLES = 3, 2  # of the tiny configuration
 PAID = RewardConfig(progress=1.0, arrival=8.0, contact=0.0, step_penalty=-0.25)
@@ -47,7 +48,10 @@ def play(tiny_world: World) -> Play:
     @functools.cache
     def compiled(rule: Arrival, limit: int) -> tuple[World, Callable, list[int]]:
         task = dataclasses.replace(tiny_world.task, arrival=rule, step_limit=limit, reward=PAID)
-        world, traces = dataclasses.replace(tiny_world, task=task), []
+        world, traces = (
+            dataclasses.replace(tiny_world, task=task, goal=goals.load(task, tiny_world.robot)),
+            [],
+        )
 
         def step(state: EnvState, action: jax.Array) -> tuple[EnvState, TimeStep]:
             traces.append(1)

@@ -14,8 +14,9 @@ import pytest
 import swarmjax
 from swarmjax.run.settings import TrainConfig
 from swarmjax.task import env
-from swarmjax.task.env import World
 from swarmjax.task.episode import Ended
+from swarmjax.task.goals import load as goals
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Arena, Trajectory
@@ -40,7 +41,9 @@ def run(tiny_config: TrainConfig, tiny_world: World) -> Run:
     """
     task = dataclasses.replace(tiny_config.task, arrival="hold")
     config = dataclasses.replace(tiny_config, task=task)
-    program = programs.build(config, dataclasses.replace(tiny_world, task=task))
+    goal = goals.load(task, tiny_world.robot)
+    world = dataclasses.replace(tiny_world, task=task, goal=goal)
+    program = programs.build(config, world)
     scene = holding.level(robots=3, obstacles=2)
     there = scene.start[:, :2].copy()
     one = np.array([there[0], scene.target[1], there[2]])

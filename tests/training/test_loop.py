@@ -16,8 +16,8 @@ from swarmjax.curriculum.config import CurriculumConfig
 from swarmjax.curriculum.engine import BY_BUDGET, NEVER, Schedule
 from swarmjax.run.checkpoint import digest, to_leaves
 from swarmjax.run.settings import TrainConfig
-from swarmjax.task.env import World
 from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.world import World
 from swarmjax.training import loop, rollout
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState

@@ -21,9 +21,10 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps, physics
 from swarmjax.task import env, observation
 from swarmjax.task import stage as task_stage
-from swarmjax.task.env import EnvState, TimeStep, World
+from swarmjax.task.env import EnvState, TimeStep
 from swarmjax.task.episode import Ended
 from swarmjax.task.level import Level
+from swarmjax.task.world import World
 from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.rollout import Arena, Program

@@ -15,7 +15,7 @@ from swarmjax.curriculum import engine as curriculum
 from swarmjax.run.checkpoint import Leaves, to_leaves
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import physics
-from swarmjax.task.env import World
+from swarmjax.task.world import World
 from swarmjax.training import loop, mesh, seeds
 from swarmjax.training import program as programs
 from swarmjax.training.loop import TrainState

@@ -121,7 +121,13 @@ function describeRun(run, t) {
   const there = robots.filter((i) => run.arrived(i, t)).length;
   const contacts = robots.flatMap((i) => run.contacts(i, t)).reduce((sum, n) => sum + n, 0);
   const over = t >= run.last && run.last < state.last ? `, over at ${seconds(run.last)}` : "";
-  return `${there} of ${run.robots} ${atTarget(run.robots)}, ${plural(contacts, "contact")}${over}`;
+  const measured = run.measures(t).map((value, k) => {
+    const [label, unit] = state.header.measures[k];
+    const shown = unit === "%" ? round(100 * value, 1) : round(value, 2);
+    return `, ${label} ${shown} ${unit}`.trimEnd();
+  });
+  return `${there} of ${run.robots} ${atTarget(run.robots)}, ${plural(contacts, "contact")}`
+    + measured.join("") + over;
 }
 
 /** Says how one robot stands, its reward term by term. */

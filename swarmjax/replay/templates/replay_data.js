@@ -48,10 +48,14 @@ function openRun(header, bytes, episode, run) {
     cell("y", i, t) * quanta.length,
     cell("yaw", i, t) * quanta.angle,
   ];
+  const target = (i, t) => (table.target
+    ? [2 * i, 2 * i + 1].map((column) => cell("target", column, t) * quanta.length)
+    : episode.target[i]);
   return {
     robots: episode.target.length,
     last: rows - 1,
     pose,
+    target,
     /** Length of ray k, or null where it meets nothing in range. */
     ray(i, k, t) {
       const whole = cell("ray", i * header.sensors + k, t);
@@ -59,11 +63,14 @@ function openRun(header, bytes, episode, run) {
     },
     distance(i, t) {
       const [x, y] = pose(i, t);
-      return Math.hypot(x - episode.target[i][0], y - episode.target[i][1]);
+      const [targetX, targetY] = target(i, t);
+      return Math.hypot(x - targetX, y - targetY);
     },
     /** Reward since the start by term, [name, sum] each. */
     terms: (i, t) => terms.map((name) => [name.slice(7), cell(name, i, t) * quanta.reward]),
     reward: (i, t) => terms.reduce((sum, name) => sum + cell(name, i, t), 0) * quanta.reward,
+    /** The goal's own measures so far. */
+    measures: (t) => header.measures.map((_, k) => cell("measured", k, t) * quanta.measure),
     touches: (i, t) => cell("touch", i, t) > 0,
     /** Contacts since the start, one number a kind. */
     contacts: (i, t) => header.kinds.map((_, kind) =>

@@ -125,7 +125,7 @@ function drawScale(context, place, side, height, theme) {
 }
 
 function drawTarget(context, place, scene, run, i, t, look) {
-  const [x, y] = scene.target[i];
+  const [x, y] = run.target(i, t);
   context.strokeStyle = context.fillStyle = look.colours[i];
   context.lineWidth = 1.5;
   context.beginPath();

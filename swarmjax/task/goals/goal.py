@@ -1,0 +1,134 @@
+"""The seam between environment and goal: where targets are, who has arrived, what is measured.
+
+Training and the judge in MuJoCo C call a goal in the same way, with JAX arrays of one arena or with
+NumPy arrays of many. A goal takes the array module from its arguments and indexes axes from the
+end, so one text serves both. A goal of an extension need not: it always gets JAX arrays of one
+arena.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+from swarmjax.task.level import Level
+from swarmjax.task.observation import View
+
+Array = Any
+State = Any  # an array, or a tuple of them
+
+
+class Measure(NamedTuple):
+    """A figure with one number per level.
+
+    Attributes:
+      label: Name of the measure in a table.
+      unit: Unit of the number. `%` means a share of 0 to 1 that is shown in per cent. A count has
+        no unit.
+      is_good: Whether larger numbers are better.
+    """
+
+    label: str
+    unit: str
+    is_good: bool = False
+
+
+class GoalSizes(NamedTuple):
+    """Numbers of the settings that goals may use.
+
+    Attributes:
+      control_step: s.
+      target_radius: distance to the target that counts as arrival, m.
+      target_speed: speed of moving targets, m/s.
+      hull_radius: m.
+      sensor_range: m.
+    """
+
+    control_step: float
+    target_radius: float
+    target_speed: float
+    hull_radius: float
+    sensor_range: float
+
+
+class Turn(NamedTuple):
+    """What a goal says after a control step.
+
+    Attributes:
+      state: the goal's state for the next step.
+      target: [..., R, 2] where each robot's target is from now on, m.
+      arrived: [..., R] whether the robot has arrived, bool. Success is the share of these robots.
+      earns: [..., R] whether the robot earns the reward `arrival`, bool; None: as episodes end.
+      measured: value so far of each of the goal's `measures`, [...] by name.
+    """
+
+    state: State
+    target: Array
+    arrived: Array
+    earns: Any = None
+    measured: Mapping[str, Array] = {}
+
+
+class Goal:
+    """A goal. This one never changes the targets, and is reached once all robots are at theirs.
+
+    Attributes:
+      ends: what ends before the time is out. `each`: a robot that arrives stops for good, and
+        the episode is over when all have. `all`: the episode is over when all robots have arrived
+        in the same control step. `never`: nothing ends.
+      moves: whether targets may change within an episode.
+      measures: figures of its own, by name.
+      sizes: numbers of the settings.
+    """
+
+    ends: Literal["each", "all", "never"] = "all"
+    moves: bool = True
+    measures: Mapping[str, Measure] = MappingProxyType({})
+
+    def __init__(self, sizes: GoalSizes) -> None:
+        self.sizes = sizes
+
+    def begin(self, level: Level) -> tuple[State, Array]:
+        """Returns the state at the start of an episode, and the targets [..., R, 2], m."""
+        return (), level.target
+
+    def advance(self, state: State, level: Level, view: View) -> Turn:
+        """Says where the robots stand after a control step.
+
+        Args:
+          state: from `begin` or from the turn before.
+          level: the level, with the targets of this step.
+          view: the arena after the step; `view.arrived` is that before the step.
+        """
+        del level
+        return Turn(state, view.target, view.present & self.is_near(view))
+
+    def is_near(self, view: View) -> Array:
+        """Returns whether each robot [..., R] is within its target."""
+        return view.distance <= self.sizes.target_radius
+
+    def drives(self, arrived: Array) -> Array:
+        """Returns which robots [..., R] obey their commands, after some have arrived."""
+        return ~arrived if self.ends == "each" else ~arrived | True
+
+    def is_under_way(self, arrived: Array) -> Array:
+        """Returns which robots [..., R] still have something to do."""
+        return ~arrived | True if self.ends == "never" else ~arrived
+
+    def is_over(self, arrived: Array, present: Array) -> Array:
+        """Returns whether the episode [...] ends because all robots that are present arrived."""
+        either: Array = arrived | ~present
+        over = either.all(axis=-1)
+        return over & False if self.ends == "never" else over
+
+    def terminates(self, before: Array, arrived: Array, present: Array) -> Array:
+        """Returns for which robots [..., R] nothing more can be earned after a control step."""
+        if self.ends == "each":
+            return arrived & ~before
+        return present & self.is_over(arrived, present)[..., None]
+
+    def measured(self, turn: Turn) -> Array:
+        """Returns the measures of a turn in the order of `measures`, [..., K] float32."""
+        xp = turn.arrived.__array_namespace__()
+        none = xp.zeros((*turn.arrived.shape[:-1], 0), xp.float32)
+        values = [xp.asarray(turn.measured[name], xp.float32)[..., None] for name in self.measures]
+        return xp.concatenate([none, *values], axis=-1)

@@ -1,0 +1,75 @@
+"""`navigate`: each robot drives to its own target, which may move.
+
+`task.arrival` says when a robot has arrived:
+
+- `latch`: a robot that comes within its target has arrived and stops for good.
+- `hold`: a robot counts as arrived while it is within its target, but it keeps driving and may
+  leave. An episode is over once all robots are within their targets in the same control step.
+  Multi-agent path finding calls this condition "stay at target" (Stern et al. 2019, "Multi-Agent
+  Pathfinding: Definitions, Variants, and Benchmarks").
+"""
+
+import math
+from typing import Any, NamedTuple
+
+from swarmjax.sim import noise
+from swarmjax.sim.noise import Stream
+from swarmjax.task.config import Arrival
+from swarmjax.task.goals.goal import Goal, GoalSizes, Turn
+from swarmjax.task.level import Level
+from swarmjax.task.observation import View
+
+Array = Any
+
+
+class Navigate(Goal):
+    """Every robot has a target that stays where it is."""
+
+    moves = False
+
+    def __init__(self, sizes: GoalSizes, arrival: Arrival = "latch") -> None:
+        super().__init__(sizes)
+        self.ends = "all" if arrival == "hold" else "each"
+
+    def advance(self, state: Any, level: Level, view: View) -> Turn:
+        """Says which robots have arrived; see `Goal.advance`."""
+        del level
+        within = view.present & self.drives(view.arrived) & self.is_near(view)
+        return Turn(state, view.target, within if self.ends == "all" else view.arrived | within)
+
+
+class TargetCourse(NamedTuple):
+    """Where moving targets go.
+
+    Attributes:
+      velocity: [..., R, 2] m/s.
+    """
+
+    velocity: Array
+
+
+class Moving(Navigate):
+    """Targets drive straight on at one speed, and bounce off the walls. Boxes don't stop them."""
+
+    moves = True
+
+    def begin(self, level: Level) -> tuple[TargetCourse, Array]:
+        """Draws the directions; see `Goal.begin`."""
+        xp, robots = level.target.__array_namespace__(), level.target.shape[-2]
+        angle = noise.uniform(level.seed, 0, Stream.TARGET_COURSE, (robots,), xp)
+        angle = angle * (2.0 * math.pi)
+        course = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
+        return TargetCourse(course * self.sizes.target_speed), level.target
+
+    def advance(self, state: TargetCourse, level: Level, view: View) -> Turn:
+        """Moves the targets; see `Goal.advance`."""
+        xp = level.target.__array_namespace__()
+        turn = super().advance(state, level, view)
+        moved = level.target + state.velocity * self.sizes.control_step
+        # Where a robot cannot get, a target does not go either.
+        most = (level.side / 2.0 - self.sizes.hull_radius)[..., None, None]
+        velocity = xp.where(
+            xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state.velocity), state.velocity
+        )
+        target = xp.where(view.present[..., None], xp.clip(moved, -most, most), level.target)
+        return turn._replace(state=TargetCourse(velocity), target=target)
