@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
-    "code lines of swarmjax": 17_690,
+    "code lines of swarmjax": 17_693,
     "code lines of benchmarks": 4_500,
     "keys of train": 137,
     "longest file": 450,
