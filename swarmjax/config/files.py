@@ -19,7 +19,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _MOST_KEY = 200  # letters of a key on the command line
 
 # Groups whose message about an unknown choice says that a path is allowed.
-_OWN_FILES = ("stage", "recipes")
+_OWN_FILES = ("stage", "robot", "realism", "recipes")
 # The group whose files set keys of all sections, as `algo=paper` does, and not only its own.
 _WHOLE = "algo"
 

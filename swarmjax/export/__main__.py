@@ -142,7 +142,7 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
     if [*map(tuple, poses)] != [*epuck.SENSOR_POSES]:
         raise PolicyError(
             f"format is webots, whose controller drives an e-puck, but the policy's robot has "
-            f"{len(poses)} other sensors: give format=c or onnx, and your own controller."
+            f"{len(poses)} sensors of its own: give format=c or onnx, and your own controller."
         )
     goal = meta["task"].get("goal", "navigate")
     if goal != "navigate" or meta["task"].get("target_speed"):

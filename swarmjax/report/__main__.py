@@ -3,14 +3,15 @@
 For one run it writes its figures, and `report.html`, which holds all of them. The run may still be
 going or may have been killed: the report leaves out a line that is not fully written. No JAX.
 
-For several runs it prints a table: see `table`.
+For several runs it prints a table and draws their success over each other: see `table` and
+`comparison`.
 
 Examples:
   # into runs/first/report
   python -m swarmjax.report run=runs/first
   # into a folder of your choice
   python -m swarmjax.report run=runs/first out=reports/first
-  # a table of several runs, arrays and sweeps
+  # a table and the curves of several runs, arrays and sweeps, into runs/report
   python -m swarmjax.report runs=runs/first,runs/array
 """
 
@@ -52,14 +53,39 @@ def write(run: Path, out: Path, made_by: str) -> list[Path]:
     return builder.write(out, content)
 
 
+def compare(runs: Sequence[Path], out: Path) -> None:
+    """Prints the table of runs, and writes the picture of the stages that they share.
+
+    Args:
+      runs: run directories.
+      out: directory of the picture; it is created.
+
+    Raises:
+      ConfigError: if a run cannot be read, or `out` cannot be written.
+    """
+    groups = table.read(runs)
+    sys.stdout.write(f"{table.text([group.line for group in groups])}\n")
+    stages = rows.shared_stages([each for group in groups for each in group.histories])
+    if not stages:
+        sys.stdout.write("No picture: these runs have no stage in common.\n")
+        return
+    from swarmjax.pages import figures as drawing
+    from swarmjax.report import comparison
+
+    png = drawing.png(comparison.success(groups, stages))
+    (picture,) = builder.write(out, {"comparison.png": png})
+    sys.stdout.write(f"{picture}: success on {words.count(len(stages), 'stage')} over training.\n")
+
+
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = files.load(ReportConfig, arguments)
     if settings.runs is not None:
-        sys.stdout.write(f"{table.text(table.read(table.find(settings.runs)))}\n")
+        runs = table.find(settings.runs)
+        compare(runs, Path(settings.out or runs[0].parent / "report"))
         return 0
     run = Path(settings.run or "")
-    out = Path(settings.out) if settings.out else run / "report"
+    out = Path(settings.out or run / "report")
     made_by = command.line("report", *arguments)
     written = write(run, out, made_by)
     figures = words.count(len(written) - 1, "figure")

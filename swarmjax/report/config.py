@@ -16,15 +16,14 @@ class ReportConfig(Section):
     runs: str | None = setting(
         None,
         "instead of run: run directories, folders of runs (an array, a sweep), "
-        "separated by commas; prints a table with one line for all runs of the same settings",
+        "separated by commas; prints a table with one line for all runs of the same settings, and "
+        "draws their success over each other",
     )
-    out: str | None = setting(None, "directory of the report of a run; null: <run>/report")
+    out: str | None = setting(
+        None, "directory of the report; null: report in the run, or beside the first of runs"
+    )
 
     def _check(self) -> None:
         if (self.run is None) == (self.runs is None):
             both = "is missing" if self.run is None else "and runs are given"
-            raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... for a table.")
-        if self.runs is not None and self.out is not None:
-            raise ConfigError(
-                f"out is {self.out}, but the table of runs is only printed: leave it out."
-            )
+            raise ConfigError(f"run {both}: give run=DIR, or runs=DIR,DIR,... to compare.")

@@ -5,6 +5,7 @@ The colour map viridis rises evenly in lightness, so stages can also be told apa
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib import colormaps
@@ -76,31 +77,46 @@ def mix(history: History) -> Figure:
 
 def success(history: History) -> Figure:
     """Draws the success of each stage in its own panel: every seed, and their IQM."""
-    stages = len(history.names)
+    titles = [_title(history, i) for i in range(len(history.names))]
+    figure, panels = success_panels(history.arena_steps[-1], titles)
+    at = spread(len(history.updates), _POINTS)
+    steps = history.arena_steps[at]
+    mean = report_rows.together(history.success)[at]
+    for i, panel in enumerate(panels):
+        panel.plot(steps, history.success[:, at, i].T, color=_SEED, lw=0.7)
+        panel.plot(steps, mean[:, i], color=_ALL, lw=2.0)
+        if len(panels) > 1:
+            panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
+    figure.supylabel(report_rows.measure(history), fontsize=10)
+    kinds = _seed_lines(history)
+    if len(panels) > 1:
+        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
+    drawing.explain(figure, kinds, 3)
+    return figure
+
+
+def success_panels(last_step: int, titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
+    """Makes a figure with a panel of success, 0 to 1, for each stage.
+
+    Args:
+      last_step: the last arena control step on the axis that all panels share.
+      titles: of each panel.
+    """
+    stages = len(titles)
     columns = min(stages, 3 if stages <= report_rows.MANY else 6 if stages <= 30 else 8)
     rows = math.ceil(stages / columns)
     figure = Figure(figsize=(max(drawing.WIDTH, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
     figure.set_layout_engine("constrained")
     panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    at = _at(len(history.updates), _POINTS)
-    steps = history.arena_steps[at]
-    mean = report_rows.together(history.success)[at]
-    for i, panel in enumerate(panels[:stages]):
-        panel.plot(steps, history.success[:, at, i].T, color=_SEED, lw=0.7)
-        panel.plot(steps, mean[:, i], color=_ALL, lw=2.0)
-        _mark(panel, history, i)
+    for i, (panel, title) in enumerate(zip(panels, titles, strict=False)):
+        drawing.dress(panel, title, 7 if stages > report_rows.MANY else 10)
         panel.tick_params(labelbottom=i + columns >= stages)
     for panel in panels[stages:]:
         panel.set_visible(False)
-    _label_steps(figure, history, 2 if stages > report_rows.MANY else 4)
+    _label_steps(figure, last_step, 2 if stages > report_rows.MANY else 4)
     panels[0].set_ylim(0, 1.02)
     panels[0].yaxis.set_major_formatter(drawing.percent())
-    figure.supylabel(report_rows.measure(history), fontsize=10)
-    kinds = _seed_lines(history)
-    if stages > 1:
-        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
-    drawing.explain(figure, kinds, 3)
-    return figure
+    return figure, panels[:stages]
 
 
 def curves(history: History) -> Figure | None:
@@ -120,12 +136,12 @@ def curves(history: History) -> Figure | None:
     for panel in panels[len(_CURVES) :]:
         panel.set_visible(False)
     panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
-    _label_steps(figure, history, 4)
+    _label_steps(figure, history.arena_steps[-1], 4)
     drawing.explain(figure, _seed_lines(history), 2)
     return figure
 
 
-def _at(updates: int, points: int) -> np.ndarray:
+def spread(updates: int, points: int) -> np.ndarray:
     """Returns the indices of evenly spread points, including the last one."""
     return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
 
@@ -135,21 +151,18 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
     Missing values are skipped. A stretch without any value is nan.
     """
-    ends = _at(len(steps), _STRETCHES) + 1
+    ends = spread(len(steps), _STRETCHES) + 1
     starts = np.concatenate([[0], ends[:-1]])
     there = np.add.reduceat(~np.isnan(values), starts, axis=1)
     sums = np.add.reduceat(np.nan_to_num(values), starts, axis=1)
     return steps[ends - 1], np.where(there, sums / np.maximum(there, 1), np.nan)
 
 
-def _mark(panel: Axes, history: History, stage: int) -> None:
-    """Writes a panel's name and last share, and draws the share that promotes."""
+def _title(history: History, stage: int) -> str:
+    """Writes a stage's name and last share."""
     last, measured = report_rows.among(history.success[:, -1])
     share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
-    small = len(history.names) > report_rows.MANY
-    drawing.dress(panel, f"{history.labels[stage]}   {share}", 7 if small else 10)
-    if len(history.names) > 1:
-        panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
+    return f"{history.labels[stage]}   {share}"
 
 
 def _seed_lines(history: History) -> list[Line2D]:
@@ -163,10 +176,10 @@ def _seed_lines(history: History) -> list[Line2D]:
     ]
 
 
-def _label_steps(figure: Figure, history: History, ticks: int) -> None:
+def _label_steps(figure: Figure, last_step: int, ticks: int) -> None:
     """Scales and labels the steps, an axis that all panels share."""
     axis = figure.axes[0].xaxis
-    figure.axes[0].set_xlim(0, history.arena_steps[-1])
+    figure.axes[0].set_xlim(0, last_step)
     axis.set_major_locator(MaxNLocator(ticks))
     axis.set_major_formatter(drawing.thousands())
     figure.supxlabel(_STEPS, fontsize=10)

@@ -7,7 +7,7 @@ written when the run was killed, so it is skipped. Any other damage raises an er
 file, line and key.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
@@ -108,8 +108,13 @@ class History:
     @property
     def success(self) -> np.ndarray:
         """The success [N, T, S] the curriculum uses: share of targets, or of whole episodes."""
+        return self.by_stage[self.decided_by]
+
+    @property
+    def decided_by(self) -> str:
+        """The name in `BY_STAGE` of the success that the curriculum uses."""
         by_targets = self.config.curriculum.success == "targets"
-        return self.by_stage["success_by_stage" if by_targets else "complete_by_stage"]
+        return "success_by_stage" if by_targets else "complete_by_stage"
 
 
 def read(run: Path) -> History:
@@ -161,6 +166,11 @@ def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
             "curves": np.array([row.get(key) for key in CURVES], np.float32),
         }
     return by_seed
+
+
+def shared_stages(histories: Sequence[History]) -> list[str]:
+    """Names the stages that all runs have, in the order of the first run."""
+    return [n for n in histories[0].names if all(n in each.names for each in histories)]
 
 
 def measure(history: History) -> str:

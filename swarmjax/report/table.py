@@ -88,8 +88,15 @@ def _has_trained(run: Path) -> bool:
     return (run / CONFIG).exists() and metrics.exists() and metrics.stat().st_size > 0
 
 
-def read(runs: Sequence[Path]) -> list[TableLine]:
-    """Reads runs and joins runs with the same settings into one line.
+class Group(NamedTuple):
+    """Runs of the same settings: their line of the table, and their histories."""
+
+    line: TableLine
+    histories: list[History]
+
+
+def read(runs: Sequence[Path]) -> list[Group]:
+    """Reads runs and joins runs with the same settings into one group.
 
     Args:
       runs: run directories.
@@ -104,7 +111,7 @@ def read(runs: Sequence[Path]) -> list[TableLine]:
         groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
     return [
-        join(group, _differences(each, flat))
+        Group(join(group, _differences(each, flat)), [history for _, history in group])
         for each, group in zip(flat, groups.values(), strict=True)
     ]
 
@@ -172,9 +179,10 @@ def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) ->
 def cells(line: TableLine) -> tuple[str, ...]:
     """Writes a line as text in the columns of `HEADS`."""
     first, count = line.runs[0], len(line.runs)
+    folder = os.path.commonpath(map(os.path.abspath, line.runs))
     seeds, unmeasured = len(line.seeds), line.success.count(None)
     return (
-        first if count == 1 else f"{count} in {os.path.commonpath(line.runs)}",
+        first if count == 1 else f"{count} in {folder}",
         line.settings or "-",
         line.stage,
         f"{line.updates:,} of {line.budget:,}",

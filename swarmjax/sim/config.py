@@ -102,8 +102,6 @@ class RobotConfig(Section):
     sensor_poses: tuple[sensors.Pose, ...] = setting(
         epuck.SENSOR_POSES,
         "x (m), y (m) and yaw (rad) of each infrared sensor, in order",
-        -sensors.MOST_YAW,
-        sensors.MOST_YAW,
     )
     sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
     sensor_height: float = setting(

@@ -47,6 +47,11 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
                 f"but hull_radius is {show(hull_radius)}: move the sensor to at most that, or give "
                 "a larger hull."
             )
+        if abs(pose[2]) > MOST_YAW:
+            raise ConfigError(
+                f"sensor_poses holds {show(pose)} for sensor {i}, but its yaw, the last number, is "
+                f"in radians: give {-MOST_YAW:.4f} to {MOST_YAW:.4f}."
+            )
         within = way_to_hull(pose, hull_radius)
         if within >= reach:
             raise ConfigError(

@@ -62,10 +62,10 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
         (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
         (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
         (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
-        ([], "run is missing: give run=DIR, or runs=DIR,DIR,... for a table."),
+        ([], "run is missing: give run=DIR, or runs=DIR,DIR,... to compare."),
         (
             ["run=good", "runs=good"],
-            "run and runs are given: give run=DIR, or runs=DIR,DIR,... for",
+            "run and runs are given: give run=DIR, or runs=DIR,DIR,... to",
         ),
         (["run=good", "step=1"], "step is not a key: give one of run, runs, out."),
         (["runs=good,gone"], "runs is 'good,gone', but 'gone' names neither a run nor a "),
@@ -73,7 +73,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
         (["runs=good,,cut"], "runs is 'good,,cut', but '' names neither a run nor a "),
         (["runs=good,same"], "good and same have the same settings and share a seed: "),
         (["runs=good,empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
-        (["runs=good", "out=a"], "out is a, but the table of runs is only printed: leave it out."),
+        (["runs=good", "out=file"], "out is file, which cannot be written: File exists."),
     ],
 )
 def test_errors_are_one_sentence(

@@ -22,6 +22,10 @@ def _rows(*success: float | None, first: int = 0) -> list[dict]:
     ]
 
 
+def _lines(runs: list[Path]) -> list[table.TableLine]:
+    return [group.line for group in table.read(runs)]
+
+
 def _array(folder: Path, jobs: list[list[float]], trained: TrainConfig = CONFIG) -> Path:
     """Writes the runs of an array of jobs, each with its own seeds and its own folder."""
     for job, success in enumerate(jobs):
@@ -35,7 +39,7 @@ def _array(folder: Path, jobs: list[list[float]], trained: TrainConfig = CONFIG)
 
 def test_seeds_of_an_array_are_one_line(tmp_path: Path) -> None:
     folder = _array(tmp_path / "mine", [[0.5, 0.6], [0.7, 0.8], [0.9, 1.0]])
-    (line,) = table.read(table.find(str(folder)))
+    (line,) = _lines(table.find(str(folder)))
     assert line.seeds == [0, 1, 2, 3, 4, 5]
     assert line.success == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0], rel=1e-6)
     assert line.mean == pytest.approx(0.75)
@@ -52,14 +56,23 @@ def test_seeds_on_devices_are_counted_with_seeds_of_one_device(tmp_path: Path) -
     _array(tmp_path / "one", [[0.5, 0.6]])
     spread = dataclasses.replace(CONFIG, seed=2, seeds=2, devices=2, seeds_by="devices")
     write(tmp_path / "two", _rows(0.7, 0.8, first=2), trained=spread)
-    (line,) = table.read(table.find(f"{tmp_path}/one,{tmp_path}/two"))
+    (line,) = _lines(table.find(f"{tmp_path}/one,{tmp_path}/two"))
     assert line.seeds == [0, 1, 2, 3]
+
+
+def test_jobs_given_by_relative_and_absolute_paths_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _array(tmp_path, [[0.5], [0.6]])
+    monkeypatch.chdir(tmp_path)
+    (line,) = _lines(table.find(f"0,{tmp_path}/1"))
+    assert table.cells(line)[0] == f"2 in {tmp_path}"
 
 
 def test_cells_of_a_sweep_are_a_line_each(tmp_path: Path) -> None:
     for cell, trained in {"a": CONFIG, "b": MORE}.items():
         write(tmp_path / cell, _rows(0.5, 0.6), trained=dataclasses.replace(trained, seeds=2))
-    lines = table.read(table.find(str(tmp_path)))
+    lines = _lines(table.find(str(tmp_path)))
     assert [line.settings for line in lines] == ["algo.epochs=1", "algo.epochs=3"]
     assert [line.interval for line in lines] == [None, None]
 
@@ -69,7 +82,7 @@ def test_stages_are_told_apart_by_their_name(tmp_path: Path) -> None:
     write(tmp_path / "a", [row(0)])
     short = ("mix", "weights", *(key for key in row(0) if key.endswith("_by_stage")))
     write(tmp_path / "b", [row(0) | {key: row(0)[key][:1] for key in short}], trained=pair)
-    lines = table.read(table.find(str(tmp_path)))
+    lines = _lines(table.find(str(tmp_path)))
     assert [line.settings for line in lines] == ["stage=pair-trio", "stage=pair"]
 
 
@@ -77,7 +90,7 @@ def test_runs_of_other_budgets_are_not_one_line(tmp_path: Path) -> None:
     write(tmp_path / "a", _rows(0.5))
     longer = dataclasses.replace(CONFIG, budget=2 * CONFIG.budget, seed=1)
     write(tmp_path / "b", _rows(0.6, first=1), trained=longer)
-    lines = table.read(table.find(str(tmp_path)))
+    lines = _lines(table.find(str(tmp_path)))
     assert [line.settings for line in lines] == ["budget=1280", "budget=2560"]
 
 
@@ -97,11 +110,11 @@ def test_a_run_that_has_not_begun_is_left_out_of_its_folder(tmp_path: Path) -> N
 
 
 def test_a_seed_that_was_not_measured_has_no_part_in_the_mean(tmp_path: Path) -> None:
-    (line,) = table.read([write(tmp_path, _rows(0.5, None, 0.7))])
+    (line,) = _lines([write(tmp_path, _rows(0.5, None, 0.7))])
     assert line.mean == pytest.approx(0.6)
     assert line.interval is None
     assert table.cells(line)[4] == "3, 2 measured"
-    (none,) = table.read([write(tmp_path, _rows(None))])
+    (none,) = _lines([write(tmp_path, _rows(None))])
     assert (none.mean, none.success) == (None, [None])
 
 
@@ -109,7 +122,7 @@ def test_a_run_that_decides_by_whole_episodes_is_measured_by_them(tmp_path: Path
     curriculum = dataclasses.replace(CONFIG.curriculum, success="all")
     given = row(0, success_by_stage=[0.9, 0.8], complete_by_stage=[0.3, 0.2])
     trained = dataclasses.replace(CONFIG, curriculum=curriculum)
-    (line,) = table.read([write(tmp_path, [given], trained=trained)])
+    (line,) = _lines([write(tmp_path, [given], trained=trained)])
     assert line.mean == pytest.approx(0.2)
     assert "Success: episodes in which all arrived on the last stage" in table.text([line])
 

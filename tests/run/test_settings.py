@@ -152,7 +152,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}, or a file .yaml."),
         (["stage=null"], f"stage is 'null': give one of {CHOICES}, or a file .yaml."),
         (["robot=legged"], "robot is 'legged': give one of khepera4, paper, planar, planar_v2, "
-         "thymio2, wheeled, wheeled_v2."),
+         "thymio2, wheeled, wheeled_v2, or a file .yaml."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
          "one stage, as in stage=s6 (in a recipe: 'stage: s6', and 'stage.side: 0.9' below it)."),

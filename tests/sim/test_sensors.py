@@ -37,6 +37,8 @@ ONE = "[[0.03,0,0]]"
         (["robot.sensor_range=0"], "robot.sensor_range is 0: give more than 0, at most 1."),
         (["robot.sensor_height=0.05"], "robot.sensor_height is 0.05: give more than 0.0025, less "
          "than 0.0475."),
+        (["robot.sensor_poses=[[0.03,0,40]]"], "robot.sensor_poses holds [0.03,0,40] for sensor 0, "
+         "but its yaw, the last number, is in radians: give -6.2832 to 6.2832."),
         (["robot.sensor_poses=[]"], "robot.sensor_poses has 0 sensors: give 1 to 32."),
         (["robot.sensor_poses=[[0.03,0]]"], "robot.sensor_poses is [0.03,0]: give 3 numbers."),
         (["robot.sensor_poses=3"], "robot.sensor_poses is 3: give a list, as in "

@@ -201,8 +201,10 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "[low,high] of whole numbers or null."),
         (["realism.mass=[0.2,0.13]"], "realism.mass is [0.2,0.13]: give the lower number first."),
         # Words.
-        (["realism=null"], "realism is 'null': give one of ideal, real, webots."),
-        (["realism=reel"], "realism is 'reel': give one of ideal, real, webots (nearest: real)."),
+        (["realism=null"], "realism is 'null': give one of ideal, real, webots, or a "
+         "file .yaml."),
+        (["realism=reel"], "realism is 'reel': give one of ideal, real, webots (nearest: real), "
+         "or a file .yaml."),
         (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
          "realism=webots."),
         (["realism.infrared=counts"], "realism.infrared is 'counts': give ideal, webots or real."),

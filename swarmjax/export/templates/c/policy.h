@@ -10,6 +10,15 @@
  *   [{{ loop.index0 }}] {{ "%-20s %-8s" | format(name, unit) }} offset {{ offset | short }}, scale {{ scale | short }}
 {% endfor %}
  *
+{% if meta.sensors.poses is defined %}
+ * Infrared sensors: place in the robot's frame, x forward and y left, and direction,
+ * counter-clockwise from x:
+ *
+{% for x, y, yaw in meta.sensors.poses %}
+ *   infrared_{{ loop.index0 }}: {{ x | short }}, {{ y | short }} m, {{ yaw | short }} rad
+{% endfor %}
+ *
+{% endif %}
  * Command, each entry within low and high:
  *
 {% for name in meta.action.names %}

@@ -1,0 +1,107 @@
+"""Draws the success of several runs over each other with Matplotlib.
+
+The runs differ in lightness and in the style of their lines, so they can also be told apart in grey
+print.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from swarmjax import words
+from swarmjax.evaluate.statistics import LEAST_DRAWN, curve, iqm
+from swarmjax.pages import figures as drawing
+from swarmjax.report import figures as report_figures
+from swarmjax.report import rows, table
+from swarmjax.report.table import Group, TableLine
+
+_POINTS = 200  # of a curve; each of them is bootstrapped
+_STYLES = ("-", "--", "-.", ":")
+_LONGEST = 60  # characters of a place or of settings in the legend
+
+
+def success(groups: Sequence[Group], stages: Sequence[str]) -> Figure:
+    """Draws the success of each stage in its own panel, with a curve for each group of runs.
+
+    A curve is the interquartile mean over seeds, where every seed has a value. From three seeds on
+    it has its 95 % bootstrap interval. The curriculum of the first run says which success it is.
+
+    Args:
+      groups: runs, in the order of the table.
+      stages: names of stages that all runs have.
+    """
+    first = groups[0].histories[0]
+    last_step = max(min(each.arena_steps[-1] for each in group.histories) for group in groups)
+    titles = [_title(groups, name) for name in stages]
+    figure, panels = report_figures.success_panels(last_step, titles)
+    looks = _looks(len(groups))
+    for group, look in zip(groups, looks, strict=True):
+        for name, panel in zip(stages, panels, strict=True):
+            _draw(panel, *_joined(group, first.decided_by, name), look)
+    figure.supylabel(f"{rows.measure(first)}, interquartile mean", fontsize=10)
+    _explain(figure, [group.line for group in groups], looks)
+    return figure
+
+
+def _looks(count: int) -> list[dict[str, Any]]:
+    """Makes the colour and style of each curve."""
+    # A lighter line than at 0.85 is hard to see on white.
+    colours = colormaps["viridis"](np.linspace(0.0, 0.85, count))
+    return [{"color": c, "ls": _STYLES[i % len(_STYLES)]} for i, c in enumerate(colours)]
+
+
+def _joined(group: Group, measure: str, stage: str) -> tuple[np.ndarray, np.ndarray]:
+    """Joins the seeds of runs on a stage, at the updates that all of the runs have done.
+
+    Returns:
+      Arena control steps [T], and success [N, T].
+    """
+    runs = group.histories
+    count = min(len(each.updates) for each in runs)
+    values = [each.by_stage[measure][:, :count, each.names.index(stage)] for each in runs]
+    return runs[0].arena_steps[:count], np.concatenate(values)
+
+
+def _draw(panel: Axes, steps: np.ndarray, success: np.ndarray, look: Mapping[str, Any]) -> None:
+    """Draws a curve with its interval."""
+    whole = np.flatnonzero(~np.isnan(success).any(axis=0))
+    if not len(whole):
+        return
+    at = whole[report_figures.spread(len(whole), _POINTS)]
+    panel.plot(steps[at], iqm(success[:, at], axis=0), lw=2.0, **look)
+    if len(success) >= LEAST_DRAWN:
+        band = curve(success[:, at])
+        panel.fill_between(steps[at], band.low, band.high, color=look["color"], alpha=0.2, lw=0)
+
+
+def _title(groups: Sequence[Group], name: str) -> str:
+    """Writes the title of a stage's panel."""
+    histories = [each for group in groups for each in group.histories]
+    stages = {each.config.stage[each.names.index(name)] for each in histories}
+    label = histories[0].labels[histories[0].names.index(name)]
+    return label if len(stages) == 1 else f"{label}, not the same in all runs"
+
+
+def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping]) -> None:
+    """Adds the legend, and makes the figure higher by it."""
+    kinds: list[Line2D | Patch] = [
+        Line2D([], [], lw=2.0, label=_label(line), **look)
+        for line, look in zip(lines, looks, strict=True)
+    ]
+    if any(len(line.seeds) >= LEAST_DRAWN for line in lines):
+        kinds.append(Patch(color="0.8", label="95 % interval over seeds"))
+    figure.set_figheight(figure.get_figheight() + 0.17 * len(kinds))
+    drawing.explain(figure, kinds, 1)
+
+
+def _label(line: TableLine) -> str:
+    """Names a curve as the table does. A label that began with _ would be left out."""
+    place, settings = table.cells(line)[0][-_LONGEST:], line.settings[:_LONGEST]
+    label = f"{words.count(len(line.seeds), 'seed')}: {place}  {settings}"
+    return label.replace("$", r"\$")  # else two of them would begin a formula
