@@ -26,6 +26,13 @@ class RunConfig(Section):
     stop_after: int | None = setting(
         None, "updates after which the run saves and stops", 0, MAX_COUNT
     )
+    stop_at: float | None = setting(
+        None,
+        "success of every seed on the last stage, by curriculum.success in a whole cohort, at "
+        "which the run ends",
+        above=0.0,
+        high=1.0,
+    )
     tensorboard: bool = setting(True, "write TensorBoard events")
     wandb: str | None = setting(None, "Weights & Biases project to log to; needs the extra wandb")
     episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")

@@ -181,6 +181,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["algo.activation=gelu"], "algo.activation is 'gelu': give tanh, relu or swish."),
         (["run.chunk=some"], "run.chunk is 'some': give a whole number or auto."),
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
+        (["run.stop_at=0"], "run.stop_at is 0: give more than 0, at most 1."),
+        (["run.stop_at=95"], "run.stop_at is 95: give more than 0, at most 1."),
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
         (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
