@@ -149,7 +149,8 @@ def _mark(panel: Axes, history: History, stage: int) -> None:
     small = len(history.names) > report_rows.MANY
     drawing.dress(panel, f"{history.labels[stage]}   {share}", 7 if small else 10)
     if len(history.names) > 1:
-        panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
+        thresholds = np.broadcast_to(history.config.curriculum.threshold, len(history.names))
+        panel.axhline(thresholds[stage], color=_LIMIT, lw=0.8, ls="--")
 
 
 def _seed_lines(history: History) -> list[Line2D]:

@@ -194,6 +194,19 @@ def test_import_needs_neither_jax_nor_hydra():
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),
+        (["curriculum.threshold=high"], "curriculum.threshold is 'high': give a number or a list, "
+         "as in [0.9,0.8]."),
+        (["curriculum.threshold=[0.8,high]"], "curriculum.threshold is 'high': give a number."),
+        (["stage=curriculum", "stage.sequence=[s1,s2]", "curriculum.threshold=[0.9,1.5]"],
+         "curriculum.threshold is [0.9,1.5]: give 0 to 1."),
+        (["stage=curriculum", "stage.sequence=[s1,s2,s3]", "curriculum.threshold=[0.9,0.8]"],
+         "curriculum.threshold is [0.9,0.8], but the number of stages is 3: give one number, or "
+         "one for each stage."),
+        (["stage=s1", "curriculum.threshold=[]"], "curriculum.threshold is [], but the number of "
+         "stages is 1: give one number, or one for each stage."),
+        (["stage=s3", "curriculum.axes.robots=[2]", "curriculum.threshold=[0.9,0.8]"],
+         "curriculum.threshold is [0.9,0.8], but curriculum.axes makes 2 stages: give one "
+         "number."),
         (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give one of sequential, "
          "mixed, adaptive, frontier, or extensions=FILE, a file that defines it."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
