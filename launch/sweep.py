@@ -99,11 +99,14 @@ class GridCell:
 
     @property
     def is_done(self) -> bool:
-        """Whether the cell's run has spent its budget."""
+        """Whether the cell's run has spent its budget, or has reached its `run.stop_at`."""
         path = self.run / directory.SUMMARY
         found = reading.read_json(path) if path.exists() else None
         if not isinstance(found, dict):
             return False
+        goal = self.settings.run.stop_at
+        if goal is not None and found.get("stopped_at") == goal:
+            return True
         return found.get("budget_spent") is True and found.get("updates") == self.settings.updates
 
 

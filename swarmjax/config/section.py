@@ -235,8 +235,12 @@ def convert(hint: object, value: object, key: str) -> object:
     Raises:
       ConfigError: if the data cannot be converted.
     """
-    lists = [each for each in values.options(hint) if values.is_list(each)]
-    if lists and not (value is None and types.NoneType in values.options(hint)):
+    kinds = values.options(hint)
+    lists = [each for each in kinds if values.is_list(each)]
+    single = (value is None and types.NoneType in kinds) or (
+        float in kinds and not isinstance(value, list | tuple)
+    )
+    if lists and not single:
         return _listed(lists[0], value, key)
     if typing.get_origin(hint) is dict:
         return _by_name(typing.get_args(hint)[1], value, key)

@@ -22,6 +22,7 @@ _NAMES = {
 }
 _LISTS = {
     int: "[64,64]",
+    float: "[0.9,0.8]",
     str: "[s1,s2]",
     float | tuple[float, float]: "[0.7,[0.8,1.2]]",
     tuple[float, float, float]: "[[0.03,-0.01,-0.3],[0.03,0.01,0.3]]",

@@ -44,8 +44,12 @@ class CurriculumConfig(Section):
         "measure of success; targets: share of targets reached; all: share of episodes in "
         "which all robots arrived",
     )
-    threshold: float = setting(
-        0.8, "success at which a stage is learned [sequential, mixed, frontier]", 0.0, 1.0
+    threshold: float | tuple[float, ...] = setting(
+        0.8,
+        "success at which a stage is learned, or a list with one for each stage "
+        "[sequential, mixed, frontier]",
+        0.0,
+        1.0,
     )
     budget_share: float = setting(
         0.5,

@@ -51,7 +51,7 @@ class Schedule(NamedTuple):
     Attributes:
       stages: [S], in order.
       deadline: [S] update at which the stage ends at the latest, int32.
-      threshold: [] success that promotes.
+      threshold: [S] success at which the stage is learned.
       floor: [] share of the arenas that is spread evenly over all stages.
       cohort_updates: [] updates of one step limit, int32.
       easier: [S, S] whether the second stage has to be learned before the first opens, bool.
@@ -59,7 +59,7 @@ class Schedule(NamedTuple):
 
     stages: Stage
     deadline: Array | np.ndarray
-    threshold: Array | np.float32
+    threshold: Array | np.ndarray
     floor: Array | np.float32
     cohort_updates: Array | np.int32
     easier: Array | np.ndarray

@@ -137,8 +137,8 @@ def promoting(
 ) -> StageChoice:
     """Moves the arenas on to the next stage; `mixed` keeps some of them on earlier stages, evenly.
 
-    The next stage begins when a whole cohort of the current stage has reached `threshold`, or at
-    the stage's deadline. At least one step limit lies between two decisions.
+    The next stage begins when a whole cohort of the current stage has reached its threshold, or at
+    its deadline. At least one step limit lies between two decisions.
 
     Args:
       state: state of the mode.
@@ -154,7 +154,7 @@ def promoting(
     last = now == deadline.shape[0] - 1
     whole = verdict.judged[now] & (state.turn - 1 >= state.since)
     settled = verdict.over | (state.turn > state.since)
-    passed = whole & (verdict.success[now] >= schedule.threshold) & ~last
+    passed = whole & (verdict.success >= schedule.threshold)[now] & ~last
     expired = settled & (update + 1 >= deadline)[now] & ~last
     reason = jnp.where(passed, BY_THRESHOLD, jnp.where(expired, BY_BUDGET, STAYED))
     stage = now + (passed | expired)
@@ -219,7 +219,7 @@ def frontier(
 ) -> StageChoice:
     """Trains the open stages that are not learned yet, and keeps some arenas on learned ones.
 
-    A stage is learned while its running success is at least `threshold`. It is open while all
+    A stage is learned while its running success is at least its `threshold`. It is open while all
     stages one step easier are learned. So success widens the frontier, failure narrows it, and no
     budget moves it. The last stage stays in training once it is open. Widening each axis by its own
     success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube with a

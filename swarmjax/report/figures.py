@@ -82,11 +82,12 @@ def success(history: History) -> Figure:
     at = spread(len(history.updates), _POINTS)
     steps = history.arena_steps[at]
     mean = report_rows.together(history.success)[at]
+    thresholds = np.broadcast_to(history.config.curriculum.threshold, len(history.names))
     for i, panel in enumerate(panels):
         panel.plot(steps, history.success[:, at, i].T, color=_SEED, lw=0.7)
         panel.plot(steps, mean[:, i], color=_ALL, lw=2.0)
         if len(panels) > 1:
-            panel.axhline(history.config.curriculum.threshold, color=_LIMIT, lw=0.8, ls="--")
+            panel.axhline(thresholds[i], color=_LIMIT, lw=0.8, ls="--")
     figure.supylabel(report_rows.measure(history), fontsize=10)
     kinds = _seed_lines(history)
     if len(panels) > 1:

@@ -65,6 +65,7 @@ def _facts(history: History) -> list[tuple[str, str]]:
     options = files.flatten(to_dict(trained.curriculum))
     seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
+    spent += " (run.stop_at is reached)" if history.has_reached else ""
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"
     stages = f"{len(names)}: {names[0]} to {names[-1]}" if len(names) > 1 else f"1: {names[0]}"
     axes = f"; by {' · '.join(trained.curriculum.axes)}" if trained.curriculum.axes else ""

@@ -116,6 +116,13 @@ class History:
         by_targets = self.config.curriculum.success == "targets"
         return "success_by_stage" if by_targets else "complete_by_stage"
 
+    @property
+    def has_reached(self) -> bool:
+        """Whether the run ended here because every seed had reached `run.stop_at`."""
+        goal, found = self.config.run.stop_at, self.summary
+        ended = found.get("updates") == int(self.updates[-1]) + 1
+        return ended and goal is not None and found.get("stopped_at") == goal
+
 
 def read(run: Path) -> History:
     """Reads a run directory.

@@ -108,6 +108,7 @@ def read(runs: Sequence[Path]) -> list[Group]:
     for run in runs:
         history = rows.read(run)
         shared = {k: v for k, v in to_dict(history.config).items() if k not in _APART}
+        shared["run"] = {"stop_at": history.config.run.stop_at}  # a run that stops early differs
         groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
     return [

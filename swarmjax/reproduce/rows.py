@@ -17,7 +17,7 @@ from swarmjax.config import ConfigError, build
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import Row
 from swarmjax.reproduce.config import ARMS, ReproduceConfig
-from swarmjax.run.directory import SUMMARY
+from swarmjax.run.directory import SUMMARY, has_ended
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
@@ -155,7 +155,7 @@ def summaries(out: Path) -> dict[str, Row]:
     """
     paths = {arm: out / arm / SUMMARY for arm in ARMS}
     every = {arm: report_rows.read_object(path) for arm, path in paths.items() if path.exists()}
-    finished = {arm: summary for arm, summary in every.items() if summary.get("budget_spent")}
+    finished = {arm: summary for arm, summary in every.items() if has_ended(summary)}
     for arm, summary in finished.items():
         times = ("train_s", "compile_s")
         report_rows.check(summary, times, report_rows.NUMBER_OR_NULL, str(paths[arm]))

@@ -153,6 +153,11 @@ def write_json(path: Path, found: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
 
 
+def has_ended(summary: Mapping[str, Any]) -> bool:
+    """Returns whether a summary says that its run ended, by its budget or by `run.stop_at`."""
+    return summary.get("budget_spent") is True or summary.get("stopped_at") is not None
+
+
 def kept_config(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
     """Makes the `config.json` of a resumed run.
 

@@ -1,13 +1,16 @@
 """Writes what a run ends with: a policy for each seed, and `summary.json`."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from swarmjax import provenance
 from swarmjax.policy import PolicyError
 from swarmjax.run import directory
 from swarmjax.run.checkpoint import Leaves
-from swarmjax.run.directory import METRICS, SUMMARY
+from swarmjax.run.directory import METRICS, SUMMARY, Row
 from swarmjax.run.errors import TrainingError
 from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
@@ -27,16 +30,37 @@ def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int
             raise TrainingError(str(error)) from None
 
 
+def has_reached(settings: TrainConfig, newest: Sequence[Row]) -> bool:
+    """Returns whether every seed has the success `run.stop_at` on the last stage.
+
+    Args:
+      settings: the config.
+      newest: the last row of each seed; empty before the first update.
+    """
+    column = {"targets": "success_by_stage", "all": "complete_by_stage"}
+    shares = [row[column[settings.curriculum.success]][-1] for row in newest]
+    if settings.run.stop_at is None or not shares or None in shares:
+        return False
+    # In float32, as the shares are: 19 of 20 targets are 0.95.
+    return bool((np.array(shares, np.float32) >= np.float32(settings.run.stop_at)).all())
+
+
 def is_current(run: Path, updates: int) -> bool:
-    """Returns whether the summary, the last file of a run, says that this budget was spent."""
+    """Returns whether the summary, the last file of a run, says that it ended at this update."""
     try:
         summary = json.loads((run / SUMMARY).read_text())
-        return summary["budget_spent"] is True and summary["updates"] == updates
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return directory.has_ended(summary) and summary["updates"] == updates
+    except (OSError, ValueError, KeyError, AttributeError, RecursionError):
         return False
 
 
-def write_summary(run: Path, program: Program[TrainConfig], updates: int, compile_s: float) -> None:
+def write_summary(
+    run: Path,
+    program: Program[TrainConfig],
+    updates: int,
+    compile_s: float,
+    stopped_at: float | None,
+) -> None:
     """Writes `summary.json`, with the totals of the run.
 
     Args:
@@ -44,6 +68,7 @@ def write_summary(run: Path, program: Program[TrainConfig], updates: int, compil
       program: the run's program.
       updates: updates that every seed has done.
       compile_s: seconds spent compiling.
+      stopped_at: `run.stop_at`, if every seed has reached it.
     """
     settings, engine = program.config, program.world.physics.engine
     rows = directory.read_rows(run / METRICS, None)
@@ -58,6 +83,7 @@ def write_summary(run: Path, program: Program[TrainConfig], updates: int, compil
             "seeds": [*settings.numbers],
             "updates": updates,
             "budget_spent": updates >= settings.updates,
+            "stopped_at": stopped_at,
             "arena_steps": steps,
             "train_s": train_s,
             "compile_s": compile_s,

@@ -116,14 +116,15 @@ class Run:
         refusal = memory.refusal(self.settings)
         with compile_cache.use(), hosts.lost_peers(), refusal, self._directory():
             self.load()
-            if self.update < self.settings.updates:
+            if not self._has_ended():
                 self.compile()
             if not self._is_finished():
                 self._open_files()
                 self._train_chunks()
                 self._write_results()
             self._display.say(sentences.success(self.settings, self._newest))
-            self._display.say(sentences.closing(self.settings, self.path, self.update))
+            ended = self._has_ended()
+            self._display.say(sentences.closing(self.settings, self.path, self.update, ended=ended))
 
     @contextmanager
     def _directory(self) -> Iterator[None]:
@@ -174,6 +175,8 @@ class Run:
         self.state = self._first_state(init, shapes, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
+        if self._has_ended():
+            self._display.say(sentences.nothing_left(settings, self.update))
 
     def _read_checkpoint(self) -> Kept | None:
         """Reads the newest sound checkpoint of the resumed run, if there is one."""
@@ -222,10 +225,20 @@ class Run:
         # A call with zero updates changes nothing, but allocates the program's working memory.
         self.state, _ = jax.block_until_ready(compiled.call(self.schedule, self.state, np.int32(0)))
 
+    def _has_ended(self) -> bool:
+        """Returns whether the budget is spent, or every seed has reached `run.stop_at`."""
+        return self.update == self.settings.updates or self._has_reached()
+
+    def _has_reached(self) -> bool:
+        """Returns whether `run.stop_at` ends the run here, which only the end of a cohort can."""
+        if self.settings.run.stop_at is None or self.update % int(self.schedule.cohort_updates):
+            return False
+        return bool(hosts.share(results.has_reached(self.settings, self._newest))[0])
+
     def _is_finished(self) -> bool:
-        """Returns whether the run was finished before: its budget is spent, and all is written."""
-        spent = self.update == self.settings.updates
-        return spent and bool(hosts.share(results.is_current(self.path, self.update))[0])
+        """Returns whether the run was finished before: it has ended, and all is written."""
+        ended = self._has_ended()
+        return ended and bool(hosts.share(results.is_current(self.path, self.update))[0])
 
     def _open_files(self) -> None:
         """Writes `config.json`."""
@@ -238,7 +251,7 @@ class Run:
             raise outputs.unwritable("run.dir", self.path, error) from None
 
     def _train_chunks(self) -> None:
-        """Trains until the budget is spent, `run.stop_after` is reached or a stop is requested.
+        """Trains until the run has ended, `run.stop_after` is reached or a stop is requested.
 
         A thread writes the checkpoints while training continues.
         """
@@ -276,12 +289,16 @@ class Run:
         settings, n = self.settings, 1
         last = settings.run.stop_after
         goal = settings.updates if last is None else min(settings.updates, last)
-        while self.update < goal and not self._must_stop():
+        while self.update < goal and not self._has_ended() and not self._must_stop():
             if settings.run.chunk != "auto":
                 n = settings.run.chunk
             elif self._seconds:
                 n = int(np.clip(CALL_SECONDS / self._pace, 1, GROWTH * n))
-            yield int(hosts.share(min(n, goal - self.update, self.program.rows))[0])
+            most = min(goal - self.update, self.program.rows)
+            if settings.run.stop_at is not None:  # calls of any length then stop at the same update
+                cohort = int(self.schedule.cohort_updates)
+                most = min(most, cohort - self.update % cohort)
+            yield int(hosts.share(min(n, most))[0])
 
     @property
     def _pace(self) -> float:
@@ -366,7 +383,8 @@ class Run:
         leaves = checkpoint.to_leaves(hosts.gather(self.state))
         results.write_policies(self.path, self.settings, leaves, self.update)
         compile_s = self.compiled.seconds if self.update > self._first else 0.0
-        results.write_summary(self.path, self.program, self.update, compile_s)
+        reached = self.settings.run.stop_at if self._has_reached() else None
+        results.write_summary(self.path, self.program, self.update, compile_s, reached)
 
     @property
     def policies(self) -> list[Path]:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from swarmjax import command, provenance, words
+from swarmjax.config import show
 from swarmjax.run import checkpoint
 from swarmjax.run.checkpoint import Kept
 from swarmjax.run.directory import Row
@@ -39,8 +40,6 @@ def first(
     skipped = [] if kept is None else kept.skipped
     for sentence in skipped if source is None else source.skipped:
         yield f"{sentence}: it was passed over."
-    if kept is not None and kept.update == settings.updates:
-        yield "nothing left to train: the budget is spent; for more, give a larger budget"
     if settings.resume is not None and kept is None:
         yield f"{settings.resume} has no checkpoint yet: the run begins from its seed."
     if source is not None:
@@ -48,6 +47,16 @@ def first(
         yield (
             f"starting with the networks and the normaliser of {settings.init_from} after {updates}"
         )
+
+
+def nothing_left(settings: TrainConfig, update: int) -> str:
+    """Says why a resumed run has nothing left to train, and what to give for more."""
+    if update == settings.updates:
+        return "nothing left to train: the budget is spent; for more, give a larger budget"
+    return (
+        f"nothing left to train: every seed has reached run.stop_at={show(settings.run.stop_at)}; "
+        "for more, give a larger one, or run.stop_at=null"
+    )
 
 
 def promotions(settings: TrainConfig, decisions: Iterable[Row]) -> Iterator[str]:
@@ -85,10 +94,10 @@ def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     return f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of episodes"
 
 
-def closing(settings: TrainConfig, run: Path, update: int) -> str:
-    """Describes what to do next with a run that has done `update` updates."""
+def closing(settings: TrainConfig, run: Path, update: int, *, ended: bool) -> str:
+    """Describes what to do next with a run that has done `update` updates, all of them or not."""
     code = [] if settings.extensions is None else [f"extensions={settings.extensions}"]
-    if update < settings.updates:
+    if not ended:
         saved = max(checkpoint.steps(run), default=0)
         how = "saved" if saved == update else f"saved at update {saved:,}, the last sound one"
         return (
@@ -97,4 +106,8 @@ def closing(settings: TrainConfig, run: Path, update: int) -> str:
         )
     policy = seed_path(run / POLICY, settings, settings.seed)
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
-    return f"done; judge {what} with: {command.line('evaluate', f'policy={policy}', *code)}"
+    why = ""
+    if update < settings.updates:
+        goal = f"run.stop_at={show(settings.run.stop_at)}"
+        why = f" after update {update:,} of {settings.updates:,}, as every seed has reached {goal}"
+    return f"done{why}; judge {what} with: {command.line('evaluate', f'policy={policy}', *code)}"

@@ -26,6 +26,13 @@ class RunConfig(Section):
     stop_after: int | None = setting(
         None, "updates after which the run saves and stops", 0, MAX_COUNT
     )
+    stop_at: float | None = setting(
+        None,
+        "success of every seed on the last stage, by curriculum.success in a whole cohort, at "
+        "which the run ends",
+        above=0.0,
+        high=1.0,
+    )
     tensorboard: bool = setting(True, "write TensorBoard events")
     wandb: str | None = setting(None, "Weights & Biases project to log to; needs the extra wandb")
     episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")
@@ -70,6 +77,7 @@ class TrainConfig(ProgramConfig):
                 f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
+        self._check_threshold()
         self._check_devices()
         self._check_budget()
         self._check_counts()
@@ -101,6 +109,19 @@ class TrainConfig(ProgramConfig):
                         f"{where}{key} is {value}, but sim.max_{key} is {most}: "
                         f"give {least} to {most}."
                     )
+
+    def _check_threshold(self) -> None:
+        given, stages = self.curriculum.threshold, len(self.stage)
+        if isinstance(given, tuple) and self.curriculum.axes:
+            raise ConfigError(
+                f"curriculum.threshold is {show(given)}, but curriculum.axes makes {stages} "
+                "stages: give one number."
+            )
+        if isinstance(given, tuple) and len(given) != stages:
+            raise ConfigError(
+                f"curriculum.threshold is {show(given)}, but the number of stages is {stages}: "
+                "give one number, or one for each stage."
+            )
 
     def _check_devices(self) -> None:
         share = self.arena_devices

@@ -119,7 +119,7 @@ def schedule(config: ProgramConfig) -> Schedule:
     return Schedule(
         stages=task_stage.stack(config.stage, extension.load(config.extensions).levels),
         deadline=np.array([*deadline, NEVER], np.int32),
-        threshold=np.float32(options.threshold),
+        threshold=np.full(len(config.stage), options.threshold, np.float32),
         floor=np.float32(options.floor),
         cohort_updates=np.int32(math.ceil(config.task.step_limit / config.algo.rollout_length)),
         easier=axes.easier(options.axes, len(config.stage)),

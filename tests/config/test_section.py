@@ -23,6 +23,7 @@ from swarmjax.task.stage_files import load_levels
 from swarmjax.watch.config import WatchConfig
 
 STAGE = {"name": "s", "robots": 2, "side": 1.0}
+TWO = ["stage=curriculum", "stage.sequence=[s1,s2]"]
 
 
 # Round trip
@@ -33,6 +34,7 @@ STAGE = {"name": "s", "robots": 2, "side": 1.0}
     [
         (load_train, []),
         (load_train, ["stage=s3", "algo.hidden_sizes=[8,16,32]", "run.chunk=9", "run.dir=a b"]),
+        (load_train, [*TWO, "curriculum.threshold=[0.9,1]"]),
         (load_train, ["stage.sequence=[s2,s1]", "sim.substeps=4", "run.chunk=7"]),
         (partial(load_levels, EvaluateConfig), ["policy=p", "stage=expanded", "workers=2"]),
         (partial(files.load, ExportConfig), ["run=r", "step=3"]),
@@ -140,6 +142,12 @@ def test_lists_become_tuples():
     train = build(TrainConfig, {"stage": [STAGE], "algo": {"hidden_sizes": [8, 16.0]}})
     assert train.algo.hidden_sizes == (8, 16)
     assert isinstance(train.stage, tuple)
+
+
+def test_a_threshold_is_a_number_or_a_list_of_numbers():
+    assert load_train([*TWO, "curriculum.threshold=1"]).curriculum.threshold == 1.0
+    made = load_train([*TWO, "curriculum.threshold=[0.9,1]"]).curriculum.threshold
+    assert repr(made) == "(0.9, 1.0)"
 
 
 def test_stages_of_a_curriculum_are_named_in_sentences():

@@ -140,7 +140,7 @@ def test_schedule(tiny_config: TrainConfig) -> None:
     assert found.stages.robots.tolist() == [1, 2, 3]
     # Half of 20 updates is split into two equal parts; the last stage has no deadline.
     assert found.deadline.tolist() == [5, 10, NEVER]
-    assert found.threshold == np.float32(0.8)
+    assert found.threshold.tolist() == [np.float32(0.8)] * 3
     assert found.cohort_updates == 2  # 16 steps, 8 an update
 
 
@@ -149,13 +149,13 @@ def test_schedule_rounds_up(tiny_config: TrainConfig) -> None:
         tiny_config,
         4,
         task=TaskConfig(step_limit=17),
-        curriculum=CurriculumConfig(budget_share=0.4, threshold=0.5),
+        curriculum=CurriculumConfig(budget_share=0.4, threshold=(0.5, 0.75, 0.25, 1.0)),
     )
     found = programs.schedule(config)
     # 0.4 of 20 updates is 8 updates, in three parts that end at 2.67, 5.33 and 8.
     assert found.deadline.tolist() == [3, 6, 8, NEVER]
     assert found.cohort_updates == 3  # 17 steps take more than two updates of 8
-    assert found.threshold == 0.5
+    assert found.threshold.tolist() == [0.5, 0.75, 0.25, 1.0]
 
 
 def test_schedule_of_the_other_modes(tiny_config: TrainConfig) -> None:

@@ -116,6 +116,18 @@ def test_a_verdict_decides(
     assert (int(found.stage), int(found.reason)) == (to, why)
 
 
+@pytest.mark.parametrize("options", [SEQUENTIAL, MIXED], ids=lambda options: options.mode)
+@pytest.mark.parametrize(
+    ("stage", "success", "to"), [(0, 0.7, 0), (0, 0.9, 1), (1, 0.59, 1), (1, 0.7, 2)]
+)
+def test_each_stage_has_its_own_threshold(
+    options: CurriculumConfig, stage: int, success: float, to: int
+) -> None:
+    numbers = _schedule(3, threshold=np.array([0.9, 0.6, 0.9], np.float32))
+    found = _choose(options, _state(stage, 3), numbers, _verdict([success] * 3), 100)
+    assert int(found.stage) == to
+
+
 @pytest.mark.parametrize(
     ("cohort", "over", "success", "why"),
     [
@@ -263,6 +275,14 @@ def test_a_sequence_of_stages_opens_one_by_one() -> None:
     assert int(found.stage) == 1
 
 
+def test_a_stage_is_learned_at_its_own_threshold() -> None:
+    numbers = _schedule(3, threshold=np.array([0.8, 0.6, 0.8], np.float32))
+    verdict = _verdict([0.5] * 3, fast=[0.7, 0.7, NAN])
+    found = _choose(FRONTIER, _state(0, 3), numbers, verdict, 3)
+    expected = 0.1 / 3 + 0.9 * np.array([0.4, 0.2, 0.4])  # the last stage is open
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-6)  # rounding of float32
+
+
 SHARES = st.lists(st.one_of(st.just(NAN), st.floats(0.0, 1.0, width=32)), min_size=1, max_size=40)
 
 
@@ -358,7 +378,7 @@ class Reference:
             return STAYED
         success = judged.get(self.stage) if self.cohort - 1 >= self.since else None
         if self.stage < self.stages - 1:
-            if success is not None and success >= self.numbers.threshold:
+            if success is not None and success >= self.numbers.threshold[self.stage]:
                 return BY_THRESHOLD
             if number + 1 >= deadline[self.stage] and (is_over or self.cohort > self.since):
                 return BY_BUDGET
@@ -386,7 +406,8 @@ class Reference:
 
     def _frontier(self) -> np.ndarray:
         """Weighs a sequence: stages that follow a learned one, or the first, and learned ones."""
-        learned = [i for i in range(self.stages - 1) if self.fast[i] >= self.numbers.threshold]
+        needed = self.numbers.threshold
+        learned = [i for i in range(self.stages - 1) if self.fast[i] >= needed[i]]
         others = [i for i in range(self.stages) if i not in learned]
         front = [i for i in others if i == 0 or i - 1 in learned]
         self.stage = max(front)
@@ -447,7 +468,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_decisions_are_those_of_the_reference(step: Step, name: str) -> None:
     options, changes = CASES[name]
-    numbers = _schedule(3, **({"threshold": np.float32(0.25)} | changes))
+    numbers = _schedule(3, **({"threshold": np.full(3, 0.25, np.float32)} | changes))
     state = engine.init(stages.make(numbers, options), numbers)
     reference, arenas, why = Reference(numbers, options), None, []
     for number in range(UPDATES):

@@ -110,13 +110,17 @@ def test_what_is_no_grid_is_refused(
         ({"budget_spent": True, "updates": 488}, True),
         ({"budget_spent": True, "updates": 487}, False),
         ({"budget_spent": False, "updates": 488}, False),
+        ({"budget_spent": False, "updates": 64, "stopped_at": 0.9}, True),
+        ({"budget_spent": False, "updates": 64, "stopped_at": 0.8}, False),
         ([1], False),
     ],
 )
-def test_a_cell_is_done_when_its_budget_is_spent(
+def test_a_cell_is_done_when_its_budget_is_spent_or_its_success_is_reached(
     sweep: Any, summary: object, done: bool, tmp_path: Path
 ) -> None:
-    (cell,) = sweep.multiply(tmp_path, ["grid.arenas=64", "stage=s1", "budget=999424"])
+    (cell,) = sweep.multiply(
+        tmp_path, ["grid.arenas=64", "stage=s1", "budget=999424", "run.stop_at=0.9"]
+    )
     assert cell.settings.updates == 488
     cell.run.mkdir()
     if summary is not None:

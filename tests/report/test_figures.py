@@ -14,7 +14,7 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.stage_config import StageConfig
 
-BOLD, THIN = "#0b4f9e", "0.62"
+BOLD, THIN, LIMIT = "#0b4f9e", "0.62", "#c04000"
 
 
 def _history(run: Path, rows: list[dict], stages: tuple[StageConfig, ...] | None = None) -> History:
@@ -108,6 +108,15 @@ def test_the_share_that_promotes_is_drawn_where_something_does(
     assert [np.asarray(line.get_ydata()).tolist() for line in drawn] == [[0.8, 0.8]] * promotes
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["seed 0"] + ["promotes"] * promotes
+
+
+def test_each_panel_shows_the_threshold_of_its_stage(tmp_path: Path) -> None:
+    history = _history(tmp_path, [_wide_row([0.5] * 2)])
+    options = replace(history.config.curriculum, threshold=(0.9, 0.7))
+    config = replace(history.config, curriculum=options)
+    figure = report_figures.success(replace(history, config=config))
+    shown = [_lines(panel, LIMIT, "--")[0][0, 1] for panel in figure.axes[:2]]
+    assert shown == [0.9, 0.7]
 
 
 def test_a_panel_for_each_of_many_stages(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from runs import row, write
 from swarmjax.report import page as report_page
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
+from swarmjax.run.settings import RunConfig
 
 FIGURES = {"mix": b"\x89PNG-mix", "success": b"\x89PNG-success"}
 
@@ -70,6 +71,13 @@ def test_the_summary_says_where_the_run_stands(tmp_path: Path) -> None:
     assert page.fact("computed by") == "not recorded before the end of the run"
     assert "threshold=0.8" in page.fact("curriculum")
     assert page.fact("made by") == "make it"
+
+
+def test_the_summary_says_that_a_run_stopped_at_its_success(tmp_path: Path) -> None:
+    history = _history(tmp_path, [row(0), row(1)])
+    config = replace(history.config, run=RunConfig(stop_at=0.9))
+    history = replace(history, config=config, summary={"updates": 2, "stopped_at": 0.9})
+    assert _page(history).fact("trained").startswith("2 of 20 updates (run.stop_at is reached), ")
 
 
 def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:

@@ -67,11 +67,17 @@ def test_an_arm_that_was_stopped_goes_on(tmp_path: Path) -> None:
     assert (again.resume, again.run.id) == (str(tmp_path / "baseline"), "first")
 
 
-@pytest.mark.parametrize("spent", [True, False])
-def test_an_arm_is_done_when_its_budget_is_spent(spent: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("spent", "stopped_at", "done"),
+    [(True, None, True), (False, 0.9, True), (False, None, False)],
+)
+def test_an_arm_is_done_when_its_run_has_ended(
+    spent: bool, stopped_at: float | None, done: bool, tmp_path: Path
+) -> None:
     (tmp_path / "baseline").mkdir()
-    (tmp_path / "baseline" / "summary.json").write_text(json.dumps({"budget_spent": spent}))
-    assert list(summaries(tmp_path)) == (["baseline"] if spent else [])
+    summary = {"budget_spent": spent, "stopped_at": stopped_at}
+    (tmp_path / "baseline" / "summary.json").write_text(json.dumps(summary))
+    assert list(summaries(tmp_path)) == (["baseline"] if done else [])
 
 
 def test_the_config_is_one_that_is_stored() -> None:

@@ -181,6 +181,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["algo.activation=gelu"], "algo.activation is 'gelu': give tanh, relu or swish."),
         (["run.chunk=some"], "run.chunk is 'some': give a whole number or auto."),
         (["run.chunk=0"], "run.chunk is 0: give 1 to 2147483647."),
+        (["run.stop_at=0"], "run.stop_at is 0: give more than 0, at most 1."),
+        (["run.stop_at=95"], "run.stop_at is 95: give more than 0, at most 1."),
         (["run.dir="], "run.dir is '': give text or null."),
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
         (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
@@ -192,6 +194,19 @@ def test_import_needs_neither_jax_nor_hydra():
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
          "than 1."),
         (["curriculum.threshold=1.5"], "curriculum.threshold is 1.5: give 0 to 1."),
+        (["curriculum.threshold=high"], "curriculum.threshold is 'high': give a number or a list, "
+         "as in [0.9,0.8]."),
+        (["curriculum.threshold=[0.8,high]"], "curriculum.threshold is 'high': give a number."),
+        (["stage=curriculum", "stage.sequence=[s1,s2]", "curriculum.threshold=[0.9,1.5]"],
+         "curriculum.threshold is [0.9,1.5]: give 0 to 1."),
+        (["stage=curriculum", "stage.sequence=[s1,s2,s3]", "curriculum.threshold=[0.9,0.8]"],
+         "curriculum.threshold is [0.9,0.8], but the number of stages is 3: give one number, or "
+         "one for each stage."),
+        (["stage=s1", "curriculum.threshold=[]"], "curriculum.threshold is [], but the number of "
+         "stages is 1: give one number, or one for each stage."),
+        (["stage=s3", "curriculum.axes.robots=[2]", "curriculum.threshold=[0.9,0.8]"],
+         "curriculum.threshold is [0.9,0.8], but curriculum.axes makes 2 stages: give one "
+         "number."),
         (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give one of sequential, "
          "mixed, adaptive, frontier, or extensions=FILE, a file that defines it."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "

@@ -186,7 +186,7 @@ def test_mixed_keeps_arenas_on_earlier_stages_within_one_trace(tiny_config: Trai
     np.testing.assert_allclose(metrics["mix"][12:20].mean(axis=0)[:3], [0.8, 0.8, 6.4], atol=1)
     # Other numbers throughout the schedule need no second trace.
     other = schedule._replace(
-        threshold=np.float32(0.1),
+        threshold=np.full(6, 0.1, np.float32),
         cohort_updates=np.int32(3),
         deadline=np.arange(1, 7, dtype=np.int32),
         stages=schedule.stages._replace(robots=np.array([1, 2, 3, 4, 5, 5], np.int32)),

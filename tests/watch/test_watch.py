@@ -19,6 +19,7 @@ from swarmjax import command
 from swarmjax.config.section import ByName
 from swarmjax.report import figures, rows
 from swarmjax.run import directory
+from swarmjax.run.settings import RunConfig
 from swarmjax.watch import __main__ as watch
 from swarmjax.watch import live_page, status
 from swarmjax.watch.config import WatchConfig
@@ -202,6 +203,21 @@ def test_the_number_of_a_dead_process_that_another_has_by_now_is_not_it(tmp_path
 def test_a_run_whose_budget_is_spent_has_ended(tmp_path: Path) -> None:
     run = write(tmp_path / "run", [row(update) for update in range(UPDATES)])
     assert _state(run) == ("ended", "It has ended: 20 of 20 updates done.")
+
+
+@pytest.mark.parametrize(
+    ("updates", "goal", "state"), [(2, 0.9, "ended"), (1, 0.9, "stopped"), (2, 0.95, "stopped")]
+)
+def test_a_run_that_has_reached_its_success_has_ended(
+    updates: int, goal: float, state: str, tmp_path: Path
+) -> None:
+    """A resumed run that asks for more, or has gone on, has not ended by its old summary."""
+    trained = replace(CONFIG, run=RunConfig(stop_at=goal))
+    run = write(tmp_path / "run", [row(0), row(1)], trained=trained)
+    (run / "summary.json").write_text(json.dumps({"updates": updates, "stopped_at": 0.9}))
+    assert _state(run)[0] == state
+    if state == "ended":
+        assert _state(run)[1] == "It has ended: 2 of 20 updates done, run.stop_at is reached."
 
 
 @pytest.mark.parametrize(("age", "state"), [(0, "trains"), (1000, "stopped")])
