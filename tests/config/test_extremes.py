@@ -124,6 +124,7 @@ UNBOUNDED = {
     *(f"algo.{key}" for key in section.keys(AlgoConfig)),
     *(f"curriculum.{key}" for key in section.keys(CurriculumConfig)),
     *("run.checkpoint_minutes", "minutes"),
+    "robot.sensor_poses",  # `sensors.check_poses` bounds places and yaws, each in its own unit
 }
 
 

@@ -97,7 +97,10 @@ def test_runs_of_other_budgets_are_not_one_line(tmp_path: Path) -> None:
 def test_runs_that_stop_at_other_successes_are_not_one_line(tmp_path: Path) -> None:
     goal = dataclasses.replace(CONFIG, run=RunConfig(stop_at=0.9))
     runs = [write(tmp_path / "a", _rows(0.5)), write(tmp_path / "b", _rows(0.9), trained=goal)]
-    assert [line.settings for line in table.read(runs)] == ["run.stop_at=null", "run.stop_at=0.9"]
+    assert [group.line.settings for group in table.read(runs)] == [
+        "run.stop_at=null",
+        "run.stop_at=0.9",
+    ]
 
 
 def test_runs_of_a_folder_and_of_its_subfolders_are_taken(tmp_path: Path) -> None:
