@@ -157,8 +157,10 @@ def _say(settings: Any, typed: Sequence[str], limits: Collection[int]) -> str:
     given = [word for word in typed if word.partition("=")[0].partition(".")[0] in _SHOWN]
     levels = f"suite {settings.suite}" if settings.suite else f"stage {settings.stage.name}"
     what = describe(settings.robot, settings.task, settings.realism)
+    friction = settings.robot.hull_friction
+    rubs = f" with hulls of friction {friction:g}" if friction else ""
     but = f" but for {' '.join(given)}" if given else ""
     steps = "" if settings.suite else f", {settings.step_limit:,} control steps an episode"
     if steps and {*limits} - {settings.step_limit}:
         steps += f" (in training {', '.join(f'{each:,}' for each in sorted(limits))})"
-    return f"as trained{but}: {what}; {settings.robot.body} body, {levels}{steps}"
+    return f"as trained{but}: {what}; {settings.robot.body} body{rubs}, {levels}{steps}"

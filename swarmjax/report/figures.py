@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from swarmjax.pages import figures as drawing
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
+from swarmjax.task.goals.goal import MEASURED
 
 _POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
 _NAMED = 24  # stages named in the legend of the mix; more names would take the figure's place
@@ -129,14 +130,16 @@ def curves(history: History) -> Figure | None:
         return None
     figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
     panels = list(figure.subplots(2, 3, sharex=True).flat)
-    for panel, (key, title) in zip(panels, _CURVES.items(), strict=False):
+    own = [key for key in history.curves if key.startswith(MEASURED)]
+    titles = {key: key.removeprefix(MEASURED).replace("_", " ") for key in own} | _CURVES
+    for panel, (key, title) in zip(panels, titles.items(), strict=False):
         steps, seeds = _stretched(history.arena_steps, history.curves[key])
         panel.plot(steps, seeds.T, color=_SEED, lw=0.7)
         panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
         drawing.dress(panel, title)
-    for panel in panels[len(_CURVES) :]:
+    for panel in panels[len(titles) :]:
         panel.set_visible(False)
-    panels[2].tick_params(labelbottom=True)  # the last row has no panel below this one
+    panels[2].tick_params(labelbottom=True)  # the last row may have no panel below this one
     _label_steps(figure, history.arena_steps[-1], 4)
     drawing.explain(figure, _seed_lines(history), 2)
     return figure

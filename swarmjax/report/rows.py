@@ -21,6 +21,7 @@ from swarmjax.evaluate.statistics import iqm
 from swarmjax.run import load_settings
 from swarmjax.run.directory import CONFIG, DECISIONS, METRICS, SUMMARY
 from swarmjax.run.settings import TrainConfig
+from swarmjax.task.goals.goal import MEASURED
 
 Row = dict[str, Any]
 
@@ -76,7 +77,7 @@ class History:
       arena_steps: [T] arena control steps of one seed by the end of the update.
       mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
       by_stage: [N, T, S] for each name in `BY_STAGE`.
-      curves: [N, T] for each name in `CURVES`.
+      curves: [N, T] for each name in `CURVES`, and for the goal's first own measure.
       seconds: training time up to the last update; None if it was not recorded.
       decisions: the curriculum's decisions as recorded, sorted by seed and update.
       summary: the run's summary as recorded; empty before the run ends.
@@ -140,6 +141,7 @@ def read(run: Path) -> History:
     lists, curves = (
         np.array([[row[key] for row in of_seed] for of_seed in rows]) for key in ("lists", "curves")
     )
+    names = by_seed[seeds[0]][updates[0]]["names"]
     columns = dict(zip(_LISTS, np.moveaxis(lists, 2, 0), strict=True))
     mix = np.nan_to_num(columns["mix"])
     return History(
@@ -149,7 +151,7 @@ def read(run: Path) -> History:
         arena_steps=np.array([row["arena_steps"] for row in rows[0]]),
         mix=mix / np.maximum(mix.sum(axis=-1, keepdims=True), 1.0),
         by_stage={key: columns[key] for key in BY_STAGE},
-        curves=dict(zip(CURVES, np.moveaxis(curves, 2, 0), strict=True)),
+        curves=dict(zip(names, np.moveaxis(curves, 2, 0), strict=True)),
         seconds=rows[0][-1]["train_s"],
         decisions=_read_decisions(run),
         summary=read_object(run / SUMMARY) if (run / SUMMARY).exists() else {},
@@ -164,13 +166,16 @@ def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
     by_seed: dict[int, dict[int, Row]] = {}
     for where, row in read_lines(run, METRICS):
         check(row, ("seed", "update", "arena_steps"), WHOLE, where)
-        check(row, ("train_s", *CURVES), NUMBER_OR_NULL, where)
+        own = [name for name in row if name.startswith(MEASURED)][:1]
+        names = (*CURVES, *own)
+        check(row, ("train_s", *names), NUMBER_OR_NULL, where)
         check(row, _LISTS, list_of(NUMBER_OR_NULL, stages), where)
         by_seed.setdefault(row["seed"], {})[row["update"]] = {
             "arena_steps": row["arena_steps"],
             "train_s": row.get("train_s"),
             "lists": np.array([row[key] for key in _LISTS], np.float32),
-            "curves": np.array([row.get(key) for key in CURVES], np.float32),
+            "names": names,
+            "curves": np.array([row.get(key) for key in names], np.float32),
         }
     return by_seed
 

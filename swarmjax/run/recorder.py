@@ -14,6 +14,7 @@ from swarmjax.run.loggers import Guarded, Logger
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import gaps
 from swarmjax.sim.config import physics_substeps
+from swarmjax.task.goals.goal import MEASURED
 
 
 def rows(
@@ -62,7 +63,8 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
         "contacts_per_robot": _share(contacts, targets),
         "ir_steps_share": _share(raw["sensed"], raw["robot_steps"]),
     }
-    return {name: _finite(value) for name, value in raw.items()} | named
+    own = {name: _share(raw[name], episodes) for name in raw if name.startswith(MEASURED)}
+    return {name: _finite(value) for name, value in raw.items()} | named | own
 
 
 def _finite(value: Any) -> Any:

@@ -43,9 +43,9 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
         away = math.hypot(*pose[:2])
         if away > hull_radius + _ROUNDING:
             raise ConfigError(
-                f"sensor_poses holds {show(pose)} for sensor {i}, {away:.4g} m from the middle, "
-                f"but hull_radius is {show(hull_radius)}: move the sensor to at most that, or give "
-                "a larger hull."
+                f"sensor_poses holds {show(pose)} for sensor {i}, {away:.6f} m from the "
+                f"middle, but hull_radius is {show(hull_radius)}: move the sensor to at most that, "
+                "rounded towards the middle, or give a larger hull."
             )
         if abs(pose[2]) > MOST_YAW:
             raise ConfigError(

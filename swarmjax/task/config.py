@@ -99,9 +99,8 @@ def describe(robot: RobotConfig, task: TaskConfig, realism: RealismConfig) -> st
     """Returns part of a sentence that describes the robot, its sensors and the task."""
     own = robot.sensor_poses != epuck.SENSOR_POSES
     sensors = f" of {len(robot.sensor_poses)} sensors" if own else ""
-    rubs = f" of friction {robot.hull_friction:g}" if robot.hull_friction else ""
     return (
-        f"hull {robot.hull_radius:g} m{rubs}, infrared{sensors} to {robot.sensor_range:g} m, at "
+        f"hull {robot.hull_radius:g} m, infrared{sensors} to {robot.sensor_range:g} m, at "
         f"most {robot.max_speed:g} m/s and {robot.max_turn_rate:g} rad/s, control step "
         f"{task.control_step:g} s, {_describe_goal(task)}, realism "
         f"{inherit.preset_of('realism', realism)}"

@@ -59,6 +59,7 @@ class Ended(NamedTuple):
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
       broken: 1 where the episode ended because the physics was no longer finite.
+      measured: [.., K] the goal's own measures; None if it has none.
       robots: results per robot, if `run.episodes` asks for them.
     """
 
@@ -74,4 +75,5 @@ class Ended(NamedTuple):
     contacts: Array
     reward: Array
     broken: Array
+    measured: Array | None = None
     robots: Robots | None = None

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax.config import ConfigError
+from swarmjax.config import ConfigError, show
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import LevelDrawing, Observation, OwnGoal, Piece
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import electronics, level
 from swarmjax.task.electronics import Sight
-from swarmjax.task.goals.goal import Goal, Turn
+from swarmjax.task.goals.goal import ENDS, Goal, Turn
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.observation import View
 from swarmjax.task.pieces import Chosen
@@ -157,6 +157,8 @@ def check_goal(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obst
             f"{label(piece)} measures nothing: make it a class of "
             "swarmjax.task.goals.goal.Goal, and give it measures = {name: Measure(label, unit)}."
         )
+    if goal.ends not in ENDS:
+        raise ConfigError(f"{label(piece)} has ends {show(goal.ends)}: give {', '.join(ENDS)}.")
     drawn, there = _level(robots, obstacles), _shape(robots, dtype=bool)
     sight = Sight(_shape(robots, len(robot.sensor_poses)), None, _shape(robots), _shape(robots))
     view = electronics.view(sight, drawn.start, drawn, there, _shape(dtype=jnp.int32))

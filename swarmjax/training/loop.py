@@ -4,6 +4,7 @@ The number of updates is an argument, so one program serves every chunk size. An
 the same run.
 """
 
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -19,6 +20,7 @@ from swarmjax.ppo.ppo import LearnerState
 from swarmjax.shards import Shards
 from swarmjax.sim import gaps
 from swarmjax.task.episode import Ended
+from swarmjax.task.goals.goal import MEASURED
 from swarmjax.training import episodes, rollout
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.rollout import Arena, Program
@@ -130,7 +132,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
                 "mix": jnp.sum(arenas.stage == every_stage, axis=-1, dtype=jnp.int32),
                 "robots": jnp.sum(arenas.level.present),
                 "transitions": jnp.sum(trajectory.valid),
-                **_episode_metrics(ended, stage),
+                **_episode_metrics(ended, stage, program.world.goal.measures),
             }
         ),
     }
@@ -217,7 +219,7 @@ def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
     return {name: jnp.sum(jnp.where(learns, x, 0.0)) / count for name, x in learned.items()}
 
 
-def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
+def _episode_metrics(ended: Ended, stage: Array, measures: Iterable[str]) -> Metrics:
     """Sums over the episodes that ended in this update on the current training stage."""
     mine = ended.stage == stage
 
@@ -226,10 +228,12 @@ def _episode_metrics(ended: Ended, stage: Array) -> Metrics:
         return jnp.sum(jnp.where(keep, x, 0), axis=(0, 1))
 
     contacts = total(ended.contacts)
+    own = () if ended.measured is None else total(ended.measured)
     sums = ("episodes", "targets", "reached", "steps", "robot_steps", "sensed", "reward")
     return {
         **{name: total(getattr(ended, name)) for name in sums},
         "complete": total(ended.all_reached),
         **{f"contacts_{kind}": contacts[i] for i, kind in enumerate(gaps.KINDS)},
+        **{f"{MEASURED}{name}": each for name, each in zip(measures, own, strict=True)},
         "broken_arenas": jnp.sum(ended.broken),
     }

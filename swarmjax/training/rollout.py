@@ -332,6 +332,7 @@ def _ended(arenas: Arena, timestep: env.TimeStep, *, by_robot: bool) -> Ended:
         contacts=mine(jnp.sum(episode.contacts, axis=-2)),
         reward=mine(jnp.sum(episode.reward, axis=-1)),
         broken=(~timestep.sound).astype(jnp.int32),
+        measured=mine(timestep.measured) if timestep.measured.shape[-1] else None,
         robots=jax.tree.map(mine, episodes.robots(arenas)) if by_robot else None,
     )
 

@@ -47,6 +47,31 @@ class KeepApart(Goal):
         return Turn(state, -view.pose[:, :2], nearest > 0.3,
                     measured={"nearest_m": nearest.min()})
 """
+MISTAKES = [
+    (
+        "    measures =",
+        "    others =",
+        "measures nothing: make it a class of swarmjax.task.goals.goal.Goal, and give it measures "
+        "= {name: Measure(label, unit)}.",
+    ),
+    ("    measures =", "    ends = 'al'\n    measures =", "has ends 'al': give each, all, never."),
+    (
+        "measured={",
+        "measured={'far': nearest.max(), ",
+        "measures far, nearest_m: return a Turn whose measured has nearest_m.",
+    ),
+    (
+        "nearest > 0.3",
+        "nearest.min() > 0.3",
+        "returns arrived as bool of shape []: return bool of shape [3].",
+    ),
+    (
+        "return Turn(state,",
+        "return Turn(nearest,",
+        "returns another state from advance than from begin: return arrays of the same shapes and "
+        "types, here ().",
+    ),
+]
 
 
 def _settings(path: Path, **rest: Any) -> EvaluateConfig:
@@ -112,11 +137,10 @@ def test_a_goal_of_ones_own_is_judged_by_its_own_measure(
 
 
 @pytest.mark.parametrize("engine", ["c", "mjx"])
-def test_a_goal_without_a_measure_is_refused(tmp_path: Path, path: Path, engine: str) -> None:
-    bare = KEEP_APART.replace("    measures =", "    others =")
-    own = extensions.write(tmp_path / "own.py", bare)
+@pytest.mark.parametrize(("old", "new", "sentence"), MISTAKES)
+def test_a_goal_with_a_mistake_is_refused(
+    tmp_path: Path, path: Path, engine: str, old: str, new: str, sentence: str
+) -> None:
+    own = extensions.write(tmp_path / "own.py", KEEP_APART.replace(old, new))
     settings = _settings(path, task=TaskConfig(goal="keep_apart"), extensions=own, engine=engine)
-    assert refusal(evaluate, settings) == (
-        "goal keep_apart measures nothing: make it a class of swarmjax.task.goals.goal.Goal, and "
-        "give it measures = {name: Measure(label, unit)}."
-    )
+    assert refusal(evaluate, settings) == f"goal keep_apart {sentence}"

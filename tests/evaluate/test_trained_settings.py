@@ -96,12 +96,10 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
 
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = trained_settings.load(EvaluateConfig, [odd, "robot.sensor_range=0.05"])[1]
-    assert said.startswith(
-        "as trained but for robot.sensor_range=0.05: hull 0.044 m of friction 1, infrared to "
-    )
+    assert said.startswith("as trained but for robot.sensor_range=0.05: hull 0.044 m, infrared to ")
     assert said.endswith(
-        "control step 0.016 s, arrival latch, realism custom; wheeled body, stage s3, 1,500 "
-        "control steps an episode (in training 500)"
+        "control step 0.016 s, arrival latch, realism custom; wheeled body with hulls of "
+        "friction 1, stage s3, 1,500 control steps an episode (in training 500)"
     )
     alike = trained_settings.load(EvaluateConfig, [odd, "steps=500"])[1]
     assert alike.endswith("stage s3, 500 control steps an episode")

@@ -8,13 +8,18 @@ arena.
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from swarmjax.task.level import Level
 from swarmjax.task.observation import View
 
 Array = Any
+End = Literal["each", "all", "never"]
+ENDS = get_args(End)
 State = Any  # an array, or a tuple of them
+
+# How the metrics of training name a goal's own measures: with this before the name.
+MEASURED = "measured_"
 
 
 class Measure(NamedTuple):
@@ -80,7 +85,7 @@ class Goal:
       sizes: numbers of the settings.
     """
 
-    ends: Literal["each", "all", "never"] = "all"
+    ends: End = "all"
     moves: bool = True
     measures: Mapping[str, Measure] = MappingProxyType({})
 
