@@ -172,3 +172,9 @@ def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
     assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
     assert not any(b"Matplotlib" in content for content in files.values())
     assert report_figures.png_files(history) == files
+
+
+def test_a_goals_own_measure_has_a_panel(tmp_path: Path) -> None:
+    rows = [row(i, entropy=0.0, measured_floor_seen=value) for i, value in enumerate([0.25, 0.75])]
+    [bold] = _lines(_panel(_history(tmp_path, rows), "floor seen"), BOLD, "-")
+    assert bold.tolist() == [[64, 0.25], [128, 0.75]]

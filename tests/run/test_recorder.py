@@ -30,6 +30,7 @@ ONE_SEED = {
     "contacts_robot": np.array([2, 0, 0]),
     "contacts_obstacle": np.array([3, 0, 0]),
     "contacts_wall": np.array([1, 0, 0]),
+    "measured_floor_seen": np.array([1.5, 0.0, 0.0]),
     "stage_success": np.array([np.nan, 0.5, 0.0]),
     "success_by_stage": np.array([[np.nan, 0.25], [0.5, np.nan], [0.0, 0.0]]),
     "mix": np.array([[8, 0], [6, 2], [0, 0]]),
@@ -52,6 +53,8 @@ def test_rows_are_counts_with_their_shares() -> None:
     assert first["episode_steps"] == 30 / 2
     assert first["contacts_per_robot"] == (2 + 3 + 1) / 4
     assert first["ir_steps_share"] == 5 / 50
+    assert first["measured_floor_seen"] == 1.5 / 2
+    assert second["measured_floor_seen"] is None
     assert first["stage_success"] is None
     assert second["targets_reached"] is None
     assert second["stage_success"] == 0.5

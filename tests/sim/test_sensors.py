@@ -81,7 +81,7 @@ def test_the_observation_has_an_entry_for_each_sensor() -> None:
 
 @pytest.mark.parametrize("name", ["khepera4", "thymio2"])
 def test_another_robot_has_its_mass_its_inertia_and_readings(name: str) -> None:
-    robot = load_train([f"robot={name}"]).robot
+    robot = load_train([f"robot={name}", "robot.body=wheeled"]).robot
     built = model.build(robot, model.ArenaSize(1, 0, 0.05), 0.016, ray_geoms=True).compile()
     assert built.body_mass.sum() == pytest.approx(robot.mass, rel=1e-12)
     data = mujoco.MjData(built)
