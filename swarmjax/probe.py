@@ -202,7 +202,8 @@ def count(ended: Ended) -> Counts:
 def paid(task: TaskConfig) -> str:
     """Returns the episodes in which a reward for arriving is paid: with `any` visitor, or `all`."""
     in_time = task.reward.step_penalty != 0  # paid for each step, also with `hold`
-    return "any" if task.arrival == "latch" or in_time else "all"
+    together = task.arrival == "hold" or task.goal == "gather"
+    return "all" if together and not in_time else "any"
 
 
 def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> Table:
@@ -211,7 +212,8 @@ def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> T
     columns = list(dict.fromkeys([settings.curriculum.success, signal]))
     table = Table(box=None if plain else box.SIMPLE)
     heads = ["stage", "robots", "episodes", *(_HEADS[each] for each in columns)]
-    more = ["at most, if independent"] if signal == "all" else []
+    holds = signal == "all" and settings.task.arrival == "hold"
+    more = ["at most, if independent"] if holds else []
     for i, head in enumerate([*heads, "control steps", "paid in the budget", *more]):
         table.add_column(head, justify="right" if i else "left", no_wrap=True)
     for stage, each in zip(settings.stage, counts, strict=True):
@@ -234,7 +236,9 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
     ]
     if on_the_way:
         return f"{' and '.join(on_the_way)} pays before any robot arrives: {begins}"
-    need = {"any": "a robot arrives", "all": "all robots are within their targets at once"}[signal]
+    holds = signal == "all" and settings.task.arrival == "hold"
+    at_once = "all robots are within their targets at once" if holds else "all robots arrive"
+    need = {"any": "a robot arrives", "all": at_once}[signal]
     nothing = "Apart from task.reward.extra, nothing" if any(reward.extra.values()) else "Nothing"
     found = [each.expected(signal, settings.budget) for each in counts]
     about, low, high = (_number(x) for x in found[-1])
@@ -247,7 +251,7 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
     if found[-1].high < 1:
         return f"{says} fewer than {high} such episodes in the budget: {use}"
     most = last.product(settings.budget)
-    if signal == "all" and not last.all and most < 1:
+    if holds and not last.all and most < 1:
         return (
             f"{says} none in {last.episodes:,} episodes, and fewer than {_number(most)} in the "
             f"budget if each robot comes to its target independently of the others: {use}"
