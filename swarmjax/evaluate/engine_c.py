@@ -275,6 +275,8 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
         begins=begins,
         touches=touches,
         sensed=(sight.ray < judge.config.robot.sensor_range).any(axis=-1),
+        under_way=judge.goal.is_under_way(before),
+        rests=~judge.goal.is_under_way(arrived),
         measured=judge.goal.measured(turn),
     )
     outcome = measures.tally(arenas.outcome, events, np)
@@ -297,7 +299,7 @@ def _turn(
     """Asks the goal; returns its answer, levels with the new targets, and the sight of them."""
     levels, before = arenas.level._replace(target=arenas.target), arenas.outcome
     view = electronics.view(sight, pose, levels, before.arrived, before.clock + 1)
-    turn = judge.goal.advance(arenas.goal, levels, view)
+    turn = judge.goal.turn(arenas.goal, levels, view)
     if not judge.goal.moves:
         return turn, levels, sight
     levels = levels._replace(target=np.asarray(turn.target, np.float64))

@@ -229,5 +229,7 @@ def _events(world: World, before: EnvState, after: EnvState, came: env.TimeStep)
         begins=after.episode.contacts - before.episode.contacts,
         touches=after.apart == 0.0,
         sensed=after.episode.sensed > before.episode.sensed,
+        under_way=world.goal.is_under_way(before.arrived),
+        rests=~world.goal.is_under_way(after.arrived),
         measured=came.measured,
     )

@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from swarmjax import epuck, extension
-from swarmjax.config import show
+from swarmjax.config import ConfigError, show
 from swarmjax.evaluate.config import EvaluateConfig
+from swarmjax.evaluate.measures import MEASURES
 from swarmjax.evaluate.rays import RayScene
 from swarmjax.extension import Extensions, LevelDrawing, Observation
 from swarmjax.policy import Policy, PolicyError
@@ -177,11 +178,15 @@ def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
     own = [piece for piece in extensions.goals if piece.name == config.task.goal]
     if not own:
         return goal
-    from swarmjax.task import extended
+    from swarmjax.task.goals import own as own_goals  # imports JAX, only for extensions
 
-    stage = config.stage
-    extended.check_goal(own[0], goal, config.robot, stage.robots, stage.obstacles)
-    return extended.SideBySide(goal)
+    taken = sorted({*goal.measures} & {*MEASURES})
+    if taken:
+        raise ConfigError(
+            f"goal {config.task.goal} measures {', '.join(taken)}, as every goal does: rename it."
+        )
+    own_goals.check(own[0], goal, config.robot, config.stage.robots, config.stage.obstacles)
+    return own_goals.SideBySide(goal)
 
 
 def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | None:

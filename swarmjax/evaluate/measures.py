@@ -65,6 +65,8 @@ class Events(NamedTuple):
       begins: [A, R, 3] whether a contact begins, by kind.
       touches: [A, R, 3] whether the robot touches something at the end of the step.
       sensed: [A, R] whether an infrared ray met something in range.
+      under_way: [A, R] whether the robot had something to do when the step began.
+      rests: [A, R] whether it has nothing to do after the step.
       measured: [A, K] the goal's own measures.
     """
 
@@ -74,6 +76,8 @@ class Events(NamedTuple):
     begins: Any
     touches: Any
     sensed: Any
+    under_way: Any
+    rests: Any
     measured: Any
 
 
@@ -110,8 +114,8 @@ def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
       step: Events of the step.
       xp: `numpy` or `jax.numpy`.
     """
-    under_way, clock = ~before.arrived, before.clock + 1
-    since = xp.where(under_way, clock[:, None], before.arrival)
+    under_way, clock = step.under_way, before.clock + 1
+    since = xp.where(~before.arrived, clock[:, None], before.arrival)
     driven = xp.linalg.norm(step.place - step.start, axis=-1)
     away = xp.linalg.norm(step.place - before.anchor, axis=-1) > STILL_RADIUS
     return Outcome(
@@ -123,7 +127,7 @@ def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
         sensed=before.sensed + (under_way & step.sensed),
         moving=before.moving + under_way,
         path=before.path + xp.where(under_way, driven, 0.0),
-        still=xp.where(away | step.arrived, 0, before.still + 1),
+        still=xp.where(away | step.rests, 0, before.still + 1),
         anchor=xp.where(away[..., None], step.place, before.anchor),
         measured=step.measured,
     )

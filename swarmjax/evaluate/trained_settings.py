@@ -96,10 +96,12 @@ def load[C: Section](
       The settings, and one line that describes what comes from the policies.
 
     Raises:
-      ConfigError: An argument is unsound, or policies were trained differently and no argument
-        decides.
+      ConfigError: An argument is unsound or not read here, or policies were trained differently and
+        no argument decides.
       PolicyError: A policy is unsound.
     """
+    if "task.step_limit" in files.parse(cls, typed):
+        raise ConfigError("task.step_limit ends only episodes of training: give steps=NUMBER.")
     if entrants is None:
         metas = {path: policy_file.read_meta(path) for path in _paths(cls, typed)}
     else:

@@ -138,6 +138,7 @@ def _try(
     goal = goals.load(config.task, config.robot, extension.load(config.extensions).goals)
     # The shortest way is that to a target that stays.
     known = None if goal.moves else shortest
+    shortest = np.zeros_like(shortest) if goal.moves else shortest
     second, steps, own = config.task.control_step, config.step_limit, goal.measures
     rows = [measures.per_level(each, second, steps, known, own) for each in outcomes]
     tables = {name: np.stack([row[name] for row in rows]) for name in rows[0]}

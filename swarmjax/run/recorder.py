@@ -63,7 +63,7 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
         "contacts_per_robot": _share(contacts, targets),
         "ir_steps_share": _share(raw["sensed"], raw["robot_steps"]),
     }
-    own = {name: _share(raw[name], episodes) for name in raw if name.startswith(MEASURED)}
+    own = {name: _finite(_share(raw[name], episodes)) for name in raw if name.startswith(MEASURED)}
     return {name: _finite(value) for name, value in raw.items()} | named | own
 
 

@@ -85,13 +85,21 @@ def diverged(settings: TrainConfig, row: Row, updates: int, *, broke: bool) -> s
 
 def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     """Describes how good the swarm is on the last stage, by the last row of each seed."""
-    shares = [row["success_by_stage"][-1] for row in newest]
-    said = f"targets reached on {settings.stage_names[-1]}: {spread(shares)}"
+    by_targets = settings.curriculum.success == "targets"
+    what = "targets reached" if by_targets else "all robots reached"
+    column = "success_by_stage" if by_targets else "complete_by_stage"
+    shares = [row[column][-1] for row in newest]
+    said = f"{what} on {settings.stage_names[-1]}: {spread(shares)}"
     if all(share is None for share in shares):
         return f"{said}: no whole cohort of episodes has ended"
     steps = settings.task.step_limit
     seconds = steps * settings.task.control_step
-    return f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of episodes"
+    measured = [row for row in newest if row[column][-1] is not None]
+    episodes = min(row["episodes_by_stage"][-1] for row in measured)
+    return (
+        f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of "
+        f"{words.count(episodes, 'episode')}"
+    )
 
 
 def closing(settings: TrainConfig, run: Path, update: int, *, ended: bool) -> str:

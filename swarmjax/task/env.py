@@ -226,7 +226,7 @@ def _turn(
 ) -> tuple[Turn, Level, Sight]:
     """Asks the goal; returns its answer, the level with the new targets, and the sight of them."""
     view = task_electronics.view(sight, pose, state.level, state.arrived, clock)
-    turn = world.goal.advance(state.goal, state.level, view)
+    turn = world.goal.turn(state.goal, state.level, view)
     if not world.goal.moves:
         return turn, state.level, sight
     distance, bearing = observation.to_target(pose, turn.target, jnp)

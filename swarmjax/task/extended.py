@@ -9,14 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from swarmjax.config import ConfigError, show
+from swarmjax.config import ConfigError
 from swarmjax.config.foreign_code import explained
-from swarmjax.extension import LevelDrawing, Observation, OwnGoal, Piece
+from swarmjax.extension import LevelDrawing, Observation, Piece
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.gaps import KINDS
 from swarmjax.task import electronics, level
 from swarmjax.task.electronics import Sight
-from swarmjax.task.goals.goal import ENDS, Goal, Turn
 from swarmjax.task.level import Level, Spacing
 from swarmjax.task.observation import View
 from swarmjax.task.pieces import Chosen
@@ -37,25 +36,6 @@ def look(own: Sequence[Observation], view: View) -> Array:
     robots = len(view.pose)
     found = [jnp.reshape(each.function(view), (robots, each.size)) for each in own]
     return jnp.concatenate(found, axis=-1).astype(jnp.float32)
-
-
-class SideBySide(Goal):
-    """A goal of an extension, for the judge: NumPy arrays of many arenas in and out."""
-
-    def __init__(self, own: Goal) -> None:
-        """Takes the goal."""
-        super().__init__(own.sizes)
-        self.ends, self.moves, self.measures = own.ends, own.moves, own.measures
-        self._begin = jax.jit(jax.vmap(own.begin))
-        self._advance = jax.jit(jax.vmap(own.advance))
-
-    def begin(self, level: Level) -> tuple[Any, Any]:
-        """See `Goal.begin`."""
-        return jax.tree.map(np.asarray, self._begin(level))
-
-    def advance(self, state: Any, level: Level, view: View) -> Turn:
-        """See `Goal.advance`."""
-        return jax.tree.map(np.asarray, self._advance(state, level, view))
 
 
 def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> Level:
@@ -123,7 +103,7 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
       ConfigError: a piece returns something else; the message says what it should return.
     """
     drawn, there, whole = (
-        _level(robots, obstacles),
+        level_shapes(robots, obstacles),
         _shape(robots, dtype=bool),
         _shape(dtype=jnp.int32),
     )
@@ -137,60 +117,6 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
         _check_floats(piece, [(robots,)], _step(infrared, robot.sensor_range))
     for piece in chosen.drawings:
         _check_drawing(piece, drawn)
-
-
-def check_goal(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles: int) -> None:
-    """Refuses a goal without measures, or whose turns have a wrong shape or type.
-
-    Args:
-      piece: the goal of the extension.
-      goal: the goal, made with the sizes of the task.
-      robot: the robot.
-      robots: R.
-      obstacles: M.
-
-    Raises:
-      ConfigError: the goal returns something else; the message says what it should return.
-    """
-    if not isinstance(goal, Goal) or not goal.measures:
-        raise ConfigError(
-            f"{label(piece)} measures nothing: make it a class of "
-            "swarmjax.task.goals.goal.Goal, and give it measures = {name: Measure(label, unit)}."
-        )
-    if goal.ends not in ENDS:
-        raise ConfigError(f"{label(piece)} has ends {show(goal.ends)}: give {', '.join(ENDS)}.")
-    drawn, there = _level(robots, obstacles), _shape(robots, dtype=bool)
-    sight = Sight(_shape(robots, len(robot.sensor_poses)), None, _shape(robots), _shape(robots))
-    view = electronics.view(sight, drawn.start, drawn, there, _shape(dtype=jnp.int32))
-    with explained(f"{label(piece)} fails"):
-        state, first = jax.eval_shape(goal.begin, drawn)
-        turn = jax.eval_shape(goal.advance, state, drawn, view)
-    if {*turn.measured} != {*goal.measures}:
-        raise ConfigError(
-            f"{label(piece)} measures {', '.join(turn.measured) or 'nothing'}: return a Turn whose "
-            f"measured has {', '.join(goal.measures)}."
-        )
-    wanted = {
-        "target of begin": (first, (robots, 2), jnp.float32),
-        "target": (turn.target, (robots, 2), jnp.float32),
-        "arrived": (turn.arrived, (robots,), bool),
-        "earns": (turn.arrived if turn.earns is None else turn.earns, (robots,), bool),
-        **{f"measured {name}": (each, (), each.dtype) for name, each in turn.measured.items()},
-    }
-    for name, (value, shape, dtype) in wanted.items():
-        if (value.shape, value.dtype) != (shape, dtype):
-            raise ConfigError(
-                f"{label(piece)} returns {name} as {value.dtype} of shape {list(value.shape)}: "
-                f"return {jnp.dtype(dtype)} of shape {list(shape)}."
-            )
-    before, after = (
-        jax.tree.map(lambda x: (x.shape, x.dtype), each) for each in (state, turn.state)
-    )
-    if before != after:
-        raise ConfigError(
-            f"{label(piece)} returns another state from advance than from begin: return arrays of "
-            f"the same shapes and types, here {before}."
-        )
 
 
 def _check_floats(piece: Piece, shapes: list[tuple[int, ...]], argument: Any) -> None:
@@ -259,7 +185,8 @@ def _step(infrared: Any, sensor_range: float) -> Step:
     )
 
 
-def _level(robots: int, obstacles: int) -> Level:
+def level_shapes(robots: int, obstacles: int) -> Level:
+    """Returns the shapes of a level's fields."""
     return Level(
         side=_shape(),
         present=_shape(robots, dtype=bool),

@@ -18,6 +18,7 @@ from swarmjax.task import stage as task_stage
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.electronics import Electronics
 from swarmjax.task.goals import load as task_goals
+from swarmjax.task.goals import own as own_goals
 from swarmjax.task.goals.goal import Goal
 from swarmjax.task.level import Spacing
 from swarmjax.task.stage_config import StageConfig, make_room
@@ -94,7 +95,7 @@ def load(
     goal = task_goals.load(task, robot, extensions.goals)
     for piece in extensions.goals:
         if piece.name == task.goal:
-            extended.check_goal(piece, goal, robot, sim.robots, sim.obstacles)
+            own_goals.check(piece, goal, robot, sim.robots, sim.obstacles)
     size = model.ArenaSize(sim.robots, sim.obstacles, task_stage.largest_half(stages))
     spacing = Spacing(*size[:2], robot.hull_radius, task.target_radius)
     room.check(stages, spacing, chosen.drawings)

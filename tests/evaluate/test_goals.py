@@ -51,10 +51,19 @@ MISTAKES = [
     (
         "    measures =",
         "    others =",
-        "measures nothing: make it a class of swarmjax.task.goals.goal.Goal, and give it measures "
-        "= {name: Measure(label, unit)}.",
+        "measures nothing: give it measures = {name: Measure(label, unit)}.",
     ),
     ("    measures =", "    ends = 'al'\n    measures =", "has ends 'al': give each, all, never."),
+    (
+        "    measures =",
+        "    drives = None\n    measures =",
+        "defines drives, which both engines share: rename it.",
+    ),
+    (
+        "return Turn(",
+        "return (lambda *parts, **more: parts)(",
+        "returns no Turn from advance: return Turn(state, target, ...).",
+    ),
     (
         "measured={",
         "measured={'far': nearest.max(), ",

@@ -94,6 +94,12 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
     assert (found.name, found.side) == ("s3", 1.1)
 
 
+def test_a_limit_that_only_training_reads_is_refused(odd: str) -> None:
+    assert refusal(trained_settings.load, EvaluateConfig, [odd, "task.step_limit=500"]) == (
+        "task.step_limit ends only episodes of training: give steps=NUMBER."
+    )
+
+
 def test_the_first_line_says_what_was_taken_and_what_was_told(odd: str) -> None:
     said = trained_settings.load(EvaluateConfig, [odd, "robot.sensor_range=0.05"])[1]
     assert said.startswith("as trained but for robot.sensor_range=0.05: hull 0.044 m, infrared to ")

@@ -174,9 +174,16 @@ def test_every_seed_must_have_the_success_on_the_last_stage(
     settings = replace(settings, run=RunConfig(stop_at=goal))
     shares = [None if each is None else float(np.float32(each)) for each in by_seed]
     newest = [
-        {"success_by_stage": [1.0, share], "complete_by_stage": [1.0, 0.5]} for share in shares
+        {
+            "success_by_stage": [1.0, share],
+            "complete_by_stage": [1.0, 0.5],
+            "episodes_by_stage": [9, 64],  # half of the 128 arenas
+        }
+        for share in shares
     ]
     assert results.has_reached(settings, newest) is reached
+    few = [row | {"episodes_by_stage": [99, 63]} for row in newest]
+    assert not results.has_reached(settings, few)
 
 
 def test_a_run_is_ended_by_the_end_of_a_cohort_only(tiny_config: TrainConfig) -> None:
@@ -184,7 +191,7 @@ def test_a_run_is_ended_by_the_end_of_a_cohort_only(tiny_config: TrainConfig) ->
     run.schedule = programs.schedule(tiny_config)
     cohort = int(run.schedule.cohort_updates)
     assert cohort > 1
-    run._newest = [{"success_by_stage": [1.0]}]
+    run._newest = [{"success_by_stage": [1.0], "episodes_by_stage": [100]}]
     ended = []
     for run.update in range(1, 2 * cohort + 1):
         ended.append(run._has_ended())

@@ -71,7 +71,7 @@ def _turns(goal: Goal, level: Level, places: list) -> list[Turn]:
     level, found = level._replace(target=target), []
     arrived = np.zeros(len(level.present), bool)
     for clock, place in enumerate(places, 1):
-        turn = goal.advance(state, level, _view(level, place, arrived.tolist(), clock))
+        turn = goal.turn(state, level, _view(level, place, arrived.tolist(), clock))
         state, arrived, level = turn.state, turn.arrived, level._replace(target=turn.target)
         found.append(turn)
     return found

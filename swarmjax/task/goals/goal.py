@@ -107,6 +107,13 @@ class Goal:
         del level
         return Turn(state, view.target, view.present & self.is_near(view))
 
+    def turn(self, state: State, level: Level, view: View) -> Turn:
+        """Advances; with `ends="each"`, a robot that has arrived stays arrived."""
+        found = self.advance(state, level, view)
+        if self.ends != "each":
+            return found
+        return found._replace(arrived=view.arrived | found.arrived)
+
     def is_near(self, view: View) -> Array:
         """Returns whether each robot [..., R] is within its target."""
         return view.distance <= self.sizes.target_radius
@@ -132,8 +139,12 @@ class Goal:
         return present & self.is_over(arrived, present)[..., None]
 
     def measured(self, turn: Turn) -> Array:
-        """Returns the measures of a turn in the order of `measures`, [..., K] float32."""
+        """Returns the measures of a turn in the order of `measures`, [..., K] float32.
+
+        A number that is not finite, which no file could hold, becomes 0.
+        """
         xp = turn.arrived.__array_namespace__()
         none = xp.zeros((*turn.arrived.shape[:-1], 0), xp.float32)
         values = [xp.asarray(turn.measured[name], xp.float32)[..., None] for name in self.measures]
-        return xp.concatenate([none, *values], axis=-1)
+        found = xp.concatenate([none, *values], axis=-1)
+        return xp.where(xp.isfinite(found), found, 0.0)

@@ -23,7 +23,7 @@ class Errands(NamedTuple):
       start: [..., R, 2] the starts of the level, m. Robots are sent to the starts and targets of
         the level, since all of them can be reached.
       target: [..., R, 2] the targets of the level, m.
-      taken: [..., R] number of each robot's target: targets are counted first, then starts.
+      taken: [..., R] number of each robot's target: 2 i is robot i's target, 2 i + 1 its start.
       count: [..., R] targets reached.
     """
 
@@ -44,7 +44,7 @@ class Lifelong(Goal):
     def begin(self, level: Level) -> tuple[Errands, Array]:
         """Begins with the level's own targets; see `Goal.begin`."""
         xp = level.target.__array_namespace__()
-        taken = xp.broadcast_to(xp.arange(level.target.shape[-2]), level.present.shape)
+        taken = xp.broadcast_to(2 * xp.arange(level.target.shape[-2]), level.present.shape)
         none = xp.zeros_like(taken)
         return Errands(level.start[..., :2], level.target, taken, none), level.target
 
@@ -53,10 +53,12 @@ class Lifelong(Goal):
         xp = level.target.__array_namespace__()
         reached = view.present & self.is_near(view)
         robots = level.target.shape[-2]
-        place = xp.concatenate([state.target, state.start], axis=-2)
+        pairs = xp.stack([state.target, state.start], axis=-2)
+        place = pairs.reshape(*pairs.shape[:-3], 2 * robots, 2)
         number = xp.arange(2 * robots)
         is_taken = (state.taken[..., None] == number).any(axis=-2)
-        there = xp.concatenate([view.present, view.present], axis=-1)
+        there = xp.repeat(view.present, 2, axis=-1)
+        # The numbers of a robot's two places do not depend on how many robots there are.
         drawn = noise.uniform(level.seed, view.clock, Stream.NEXT_TARGET, (2 * robots,), xp)
         # Free places come first, in random order. The k-th robot that arrives takes the k-th.
         order = xp.argsort(xp.where(there & ~is_taken, drawn, 2.0), axis=-1, stable=True)

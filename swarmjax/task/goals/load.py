@@ -44,4 +44,7 @@ def load(task: TaskConfig, robot: RobotConfig, own: Sequence[OwnGoal] = ()) -> G
             f"task.goal is {show(task.goal)}: give one of {', '.join(('navigate', *there))}, or "
             "extensions=FILE, the file that defines it."
         )
-    return there[task.goal](sizes)
+    cls = there[task.goal]
+    if not (isinstance(cls, type) and issubclass(cls, Goal)):
+        raise ConfigError(f"goal {task.goal} is no class of swarmjax.task.goals.goal.Goal.")
+    return cls(sizes)

@@ -35,7 +35,7 @@ class Navigate(Goal):
         """Says which robots have arrived; see `Goal.advance`."""
         del level
         within = view.present & self.drives(view.arrived) & self.is_near(view)
-        return Turn(state, view.target, within if self.ends == "all" else view.arrived | within)
+        return Turn(state, view.target, within)
 
 
 class TargetCourse(NamedTuple):

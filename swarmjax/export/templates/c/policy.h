@@ -39,7 +39,7 @@
 #define POLICY_DIGEST "{{ policy.digest }}"
 #define POLICY_CONTROL_STEP {{ meta.task.control_step | float32 }} /* s */
 #define POLICY_TARGET_RADIUS {{ meta.task.target_radius | float32 }} /* m, distance to the target that counts as arrival */
-#define POLICY_HOLDS {{ 1 if meta.task.arrival == 'hold' else 0 }} /* 1: it keeps driving within that distance; 0: stop the robot there for good */
+#define POLICY_HOLDS {{ 1 if meta.task.arrival == 'hold' or meta.task.get('goal', 'navigate') != 'navigate' else 0 }} /* 1: it keeps driving within that distance; 0: stop the robot there for good */
 
 {% if memory %}
 #define POLICY_MEMORY {{ memory }}
