@@ -206,14 +206,18 @@ def paid(task: TaskConfig) -> str:
     return "all" if together and not in_time else "any"
 
 
+def _holds(task: TaskConfig) -> bool:
+    """Returns whether only robots that are within their targets at once are paid."""
+    return task.arrival == "hold" and paid(task) == "all"
+
+
 def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> Table:
     """Makes the table with a row for each stage."""
     signal = paid(settings.task)
     columns = list(dict.fromkeys([settings.curriculum.success, signal]))
     table = Table(box=None if plain else box.SIMPLE)
     heads = ["stage", "robots", "episodes", *(_HEADS[each] for each in columns)]
-    holds = signal == "all" and settings.task.arrival == "hold"
-    more = ["at most, if independent"] if holds else []
+    more = ["at most, if independent"] if _holds(settings.task) else []
     for i, head in enumerate([*heads, "control steps", "paid in the budget", *more]):
         table.add_column(head, justify="right" if i else "left", no_wrap=True)
     for stage, each in zip(settings.stage, counts, strict=True):
@@ -236,7 +240,7 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
     ]
     if on_the_way:
         return f"{' and '.join(on_the_way)} pays before any robot arrives: {begins}"
-    holds = signal == "all" and settings.task.arrival == "hold"
+    holds = _holds(settings.task)
     at_once = "all robots are within their targets at once" if holds else "all robots arrive"
     need = {"any": "a robot arrives", "all": at_once}[signal]
     nothing = "Apart from task.reward.extra, nothing" if any(reward.extra.values()) else "Nothing"

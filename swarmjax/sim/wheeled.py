@@ -34,7 +34,7 @@ _PENETRATION = 0.5  # share of the penetration that one physics step removes
 _IMPEDANCE = 0.999  # impedance of the grip; the grip cancels all but a thousandth of gravity
 # m; from the middle of a tyre to the wheel's frame. The e-puck's tyre is 5 mm wide, so its geom
 # lies off this frame. If a geom is compiled at the origin of its body's frame, MuJoCo treats it as
-# fixed there, whatever `geom_pos` is.
+# fixed there; `geom_pos` does not move it.
 _TO_INNER_EDGE = 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
 

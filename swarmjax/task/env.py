@@ -173,9 +173,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     active = level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    sight = _look(world, pose, level, state.factors)
-    to_old_target = sight.distance
-    turn, level, sight = _turn(world, state, sight, pose, clock)
+    looked = _look(world, pose, level, state.factors)  # at the targets of before
+    turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
@@ -196,8 +195,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     )
     begun = begins & active[:, None]
     earns = ends if turn.earns is None else turn.earns
-    earned = _reward_step(world, state, after, sight, earns, begun, pose, action)
-    earned = earned._replace(distance=to_old_target)
+    earned = _reward_step(world, state, after, looked, earns, begun, pose, action)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
@@ -252,10 +250,10 @@ def _reward_step(
     pose: Array,
     action: Array,
 ) -> reward.Step:
-    """Assembles the input of the reward terms."""
+    """Assembles the input of the reward terms; `sight` is still of the targets of before."""
     step = reward.Step(
         distance_before=before.distance,
-        distance=after.distance,
+        distance=sight.distance,
         infrared=sight.ray,
         sensor_range=world.robot.sensor_range,
         arrives=arrives,

@@ -102,19 +102,13 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
     Raises:
       ConfigError: a piece returns something else; the message says what it should return.
     """
-    drawn, there, whole = (
-        level_shapes(robots, obstacles),
-        _shape(robots, dtype=bool),
-        _shape(dtype=jnp.int32),
-    )
-    infrared = _shape(robots, len(robot.sensor_poses))
-    sight = Sight(infrared, None, _shape(robots), _shape(robots))
-    seen = electronics.view(sight, drawn.start, drawn, there, whole)
+    drawn = level_shapes(robots, obstacles)
+    seen = view_shapes(drawn, robot)
     for piece in chosen.observations:
         shapes = [(robots, piece.size)] + ([(robots,)] if piece.size == 1 else [])
         _check_floats(piece, shapes, seen)
     for piece, _ in chosen.terms:
-        _check_floats(piece, [(robots,)], _step(infrared, robot.sensor_range))
+        _check_floats(piece, [(robots,)], _step(seen.infrared, robot.sensor_range))
     for piece in chosen.drawings:
         _check_drawing(piece, drawn)
 
@@ -183,6 +177,14 @@ def _step(infrared: Any, sensor_range: float) -> Step:
         present=there,
         clock=_shape(dtype=jnp.int32),
     )
+
+
+def view_shapes(drawn: Level, robot: RobotConfig) -> View:
+    """Returns the shapes of a view's fields, in a level of these shapes."""
+    robots = drawn.present.shape[0]
+    sight = Sight(_shape(robots, len(robot.sensor_poses)), None, _shape(robots), _shape(robots))
+    there, clock = _shape(robots, dtype=bool), _shape(dtype=jnp.int32)
+    return electronics.view(sight, drawn.start, drawn, there, clock)
 
 
 def level_shapes(robots: int, obstacles: int) -> Level:

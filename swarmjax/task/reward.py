@@ -21,7 +21,7 @@ class Step(NamedTuple):
 
     Attributes:
       distance_before: [R] distance to the target, m.
-      distance: [R] distance to the target after the step, m.
+      distance: [R] distance after the step to the same target, m; it may move only then.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all

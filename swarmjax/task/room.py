@@ -52,7 +52,7 @@ def must_check(stage: StageConfig, hull: float) -> bool:
     """Returns whether the levels of a stage might lack room for hulls of this radius.
 
     Raises:
-      ConfigError: the stage is too small for such hulls, whatever is drawn.
+      ConfigError: no level of the stage has room for such hulls.
     """
     if stage.gap is not None and np.min(stage.gap) < 2 * hull:
         raise ConfigError(

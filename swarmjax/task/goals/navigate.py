@@ -10,7 +10,7 @@
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 from swarmjax.sim import noise
 from swarmjax.sim.noise import Stream
@@ -31,45 +31,27 @@ class Navigate(Goal):
         super().__init__(sizes)
         self.ends = "all" if arrival == "hold" else "each"
 
-    def advance(self, state: Any, level: Level, view: View) -> Turn:
-        """Says which robots have arrived; see `Goal.advance`."""
-        del level
-        within = view.present & self.drives(view.arrived) & self.is_near(view)
-        return Turn(state, view.target, within)
-
-
-class TargetCourse(NamedTuple):
-    """Where moving targets go.
-
-    Attributes:
-      velocity: [..., R, 2] m/s.
-    """
-
-    velocity: Array
-
 
 class Moving(Navigate):
     """Targets drive straight on at one speed, and bounce off the walls. Boxes don't stop them."""
 
     moves = True
 
-    def begin(self, level: Level) -> tuple[TargetCourse, Array]:
-        """Draws the directions; see `Goal.begin`."""
+    def begin(self, level: Level) -> tuple[Array, Array]:
+        """Draws the velocities [..., R, 2], m/s; see `Goal.begin`."""
         xp, robots = level.target.__array_namespace__(), level.target.shape[-2]
         angle = noise.uniform(level.seed, 0, Stream.TARGET_COURSE, (robots,), xp)
         angle = angle * (2.0 * math.pi)
         course = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
-        return TargetCourse(course * self.sizes.target_speed), level.target
+        return course * self.sizes.target_speed, level.target
 
-    def advance(self, state: TargetCourse, level: Level, view: View) -> Turn:
+    def advance(self, state: Array, level: Level, view: View) -> Turn:
         """Moves the targets; see `Goal.advance`."""
         xp = level.target.__array_namespace__()
         turn = super().advance(state, level, view)
-        moved = level.target + state.velocity * self.sizes.control_step
+        moved = level.target + state * self.sizes.control_step
         # Where a robot cannot get, a target does not go either.
         most = (level.side / 2.0 - self.sizes.hull_radius)[..., None, None]
-        velocity = xp.where(
-            xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state.velocity), state.velocity
-        )
+        velocity = xp.where(xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state), state)
         target = xp.where(view.present[..., None], xp.clip(moved, -most, most), level.target)
-        return turn._replace(state=TargetCourse(velocity), target=target)
+        return turn._replace(state=velocity, target=target)

@@ -11,8 +11,7 @@ from swarmjax.config import ConfigError, show
 from swarmjax.config.foreign_code import explained
 from swarmjax.extension import OwnGoal
 from swarmjax.sim.config import RobotConfig
-from swarmjax.task import electronics, extended
-from swarmjax.task.electronics import Sight
+from swarmjax.task import extended
 from swarmjax.task.goals.goal import ENDS, Goal, Measure, Turn
 from swarmjax.task.level import Level
 from swarmjax.task.observation import View
@@ -56,9 +55,7 @@ def check(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles
     name = extended.label(piece)
     _check_class(name, goal)
     drawn = extended.level_shapes(robots, obstacles)
-    rays, one = _shape(robots, len(robot.sensor_poses)), _shape(robots)
-    there, clock = _shape(robots, dtype=bool), _shape(dtype=jnp.int32)
-    view = electronics.view(Sight(rays, None, one, one), drawn.start, drawn, there, clock)
+    view = extended.view_shapes(drawn, robot)
     with explained(f"{name} fails"):
         state, first = jax.eval_shape(goal.begin, drawn)
         found = jax.eval_shape(goal.advance, state, drawn, view)
@@ -120,7 +117,3 @@ def _is_plain(state: Any) -> bool:
     if isinstance(state, tuple):
         return all(map(_is_plain, state))
     return isinstance(state, jax.ShapeDtypeStruct)
-
-
-def _shape(*shape: int, dtype: Any = jnp.float32) -> Any:
-    return jax.ShapeDtypeStruct(shape, dtype)
