@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.run import Run
 
         try:
-            Run(settings, stop=stop, display=Display()).train()
+            Run(settings, stop=stop, display=Display(), keep_traces=__name__ == "__main__").train()
         except Exception as error:
             return _failed(error, stop)
         return stop.code or 0
