@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.stages import Lowered
+from jax import stages
 
 from swarmjax import outputs, words
 from swarmjax.config import ConfigError, reading, to_dict
@@ -171,22 +171,22 @@ class Run:
         return TrainingError(f"{why}{saved}")
 
     def load(self) -> None:
-        """Builds the program and the first state, from the seed or from a checkpoint."""
+        """Builds the program. Traces what makes the first state, or reads it from a checkpoint."""
         self._stop.check()
         settings, self._kept = self.settings, self._read_checkpoint()
-        source = self._source = warm_start.read(settings) if self._kept is None else None
+        self._source = warm_start.read(settings) if self._kept is None else None
         self._display.say("building the arenas ...")
         self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
         init, given = jax.jit(mesh.init(self.program)), (self.schedule, mesh.lanes(settings))
         if self._keep_traces:
             init = traces.keep(self.program, "init", init, given, donated=())
-        self._shapes = init.eval_shape(*given)  # a lowering uses the same trace
+        self._shapes = init.eval_shape(*given)
         if self._kept is None:
-            self._init = init.lower(*given)
+            self._init = init.lower(*given)  # does not trace again
         else:
             leaves = checkpoint.from_leaves(self._kept.leaves, self._shapes)
             self.state = mesh.put(self.program, leaves)
-        for sentence in sentences.first(self.program, self.path, self._kept, source):
+        for sentence in sentences.first(self.program, self.path, self._kept, self._source):
             self._display.say(sentence)
         if self._has_ended():
             self._display.say(sentences.nothing_left(settings, self.update))
@@ -210,25 +210,29 @@ class Run:
         return kept
 
     def compile(self) -> None:
-        """Compiles the program and claims its memory, so that training cannot run out later."""
+        """Compiles the programs and claims memory, so that training cannot run out later."""
         self._display.say("compiling ...")
         self._stop.check()
-        with ThreadPoolExecutor(1) as other:  # XLA compiles a program mostly on one core
+        with ThreadPoolExecutor(1) as other:  # XLA uses mostly one core for a program
             init = other.submit(self._init.compile) if self._kept is None else None
             compiled = compile_chunk(
                 self.program, self.schedule, self._shapes, keep_trace=self._keep_traces
             )
         memory.check(self.settings, compiled.memory_bytes)
         if init is not None:
-            self.state = init.result()(self.schedule, mesh.lanes(self.settings))
-        if self._source is not None:
-            self.state = warm_start.carry(self._source, self.state, self.settings)
+            self.state = self._first_state(init.result())
         began = time.perf_counter()
         self._claim(compiled)
         seconds = compiled.seconds + time.perf_counter() - began
         self.compiled = replace(compiled, seconds=seconds)
         self._stop.check()
         self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
+
+    def _first_state(self, init: stages.Compiled) -> TrainState:
+        """Draws the state from the seed, with what a warm start takes from another run."""
+        state = init(self.schedule, mesh.lanes(self.settings))
+        source = self._source
+        return state if source is None else warm_start.carry(source, state, self.settings)
 
     def _claim(self, compiled: Compiled) -> None:
         """Builds Warp's kernels, and allocates the program's memory."""

@@ -60,7 +60,7 @@ def _can_keep(program: Program[TrainConfig]) -> bool:
     """Returns whether the key covers the whole trace, and the trace is all that a call needs."""
     config = program.config
     # Tracing also registers Warp's kernels and Triton's, and an extension may import any file.
-    on_cpu = jax.default_backend() == "cpu" and not program.world.physics.engine.builds_kernels
+    on_cpu = jax.default_backend() == "cpu" and program.world.physics.engine.impl == "jax"
     return on_cpu and config.devices == 1 and config.extensions is None
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from swarmjax.config import ConfigError
-from swarmjax.curriculum.engine import Schedule
 from swarmjax.shards import AXIS
 from swarmjax.sim.physics import PhysicsState
 from swarmjax.training import loop, seeds
