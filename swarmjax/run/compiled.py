@@ -54,7 +54,7 @@ def compile_chunk(
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
     given, jitted = (schedule, part, np.int32(1)), mesh.jit_chunk(program)
     if keep_trace:
-        jitted = traces.keep(program, "chunk", jitted, given, donated=1)
+        jitted = traces.keep(program, "chunk", jitted, given, donated=(1,))
     lowered = jitted.lower(*given)
     fixed = program.config.run.deterministic
     call = lowered.compile(programs.compiler_options(deterministic=fixed))

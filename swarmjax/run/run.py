@@ -3,7 +3,6 @@
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
@@ -12,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax import stages
 
 from swarmjax import outputs, words
 from swarmjax.config import ConfigError, reading, to_dict
@@ -171,22 +169,17 @@ class Run:
         return TrainingError(f"{why}{saved}")
 
     def load(self) -> None:
-        """Builds the program. Traces what makes the first state, or reads it from a checkpoint."""
+        """Builds the program and the first state, from the seed or from a checkpoint."""
         self._stop.check()
         settings, self._kept = self.settings, self._read_checkpoint()
-        self._source = warm_start.read(settings) if self._kept is None else None
+        source = warm_start.read(settings) if self._kept is None else None
         self._display.say("building the arenas ...")
         self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
         init, given = jax.jit(mesh.init(self.program)), (self.schedule, mesh.lanes(settings))
         if self._keep_traces:
-            init = traces.keep(self.program, "init", init, given, donated=())
-        self._shapes = init.eval_shape(*given)
-        if self._kept is None:
-            self._init = init.lower(*given)  # does not trace again
-        else:
-            leaves = checkpoint.from_leaves(self._kept.leaves, self._shapes)
-            self.state = mesh.put(self.program, leaves)
-        for sentence in sentences.first(self.program, self.path, self._kept, self._source):
+            init = traces.keep(self.program, "init", init, given)
+        self.state = self._first_state(init, given, source)
+        for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
         if self._has_ended():
             self._display.say(sentences.nothing_left(settings, self.update))
@@ -209,30 +202,29 @@ class Run:
         self.update = self._first = kept.update
         return kept
 
+    def _first_state(
+        self, init: Any, given: tuple[Schedule, np.ndarray], source: Kept | None
+    ) -> TrainState:
+        if self._kept is None:
+            state = init(*given)
+            return state if source is None else warm_start.carry(source, state, self.settings)
+        shapes = init.eval_shape(*given)
+        return mesh.put(self.program, checkpoint.from_leaves(self._kept.leaves, shapes))
+
     def compile(self) -> None:
-        """Compiles the programs and claims memory, so that training cannot run out later."""
+        """Compiles the program and claims its memory, so that training cannot run out later."""
         self._display.say("compiling ...")
         self._stop.check()
-        with ThreadPoolExecutor(1) as other:  # XLA uses mostly one core for a program
-            init = other.submit(self._init.compile) if self._kept is None else None
-            compiled = compile_chunk(
-                self.program, self.schedule, self._shapes, keep_trace=self._keep_traces
-            )
+        compiled = compile_chunk(
+            self.program, self.schedule, self.state, keep_trace=self._keep_traces
+        )
         memory.check(self.settings, compiled.memory_bytes)
-        if init is not None:
-            self.state = self._first_state(init.result())
         began = time.perf_counter()
         self._claim(compiled)
         seconds = compiled.seconds + time.perf_counter() - began
         self.compiled = replace(compiled, seconds=seconds)
         self._stop.check()
         self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
-
-    def _first_state(self, init: stages.Compiled) -> TrainState:
-        """Draws the state from the seed, with what a warm start takes from another run."""
-        state = init(self.schedule, mesh.lanes(self.settings))
-        source = self._source
-        return state if source is None else warm_start.carry(source, state, self.settings)
 
     def _claim(self, compiled: Compiled) -> None:
         """Builds Warp's kernels, and allocates the program's memory."""

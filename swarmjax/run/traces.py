@@ -28,7 +28,13 @@ from swarmjax.training.rollout import Program
 _NOT_TRACED = ("run", "resume", "init_from", "seed")
 
 
-def keep(program: Program[TrainConfig], name: str, jitted: Any, given: tuple, donated: Any) -> Any:
+def keep(
+    program: Program[TrainConfig],
+    name: str,
+    jitted: Any,
+    given: tuple,
+    donated: tuple[int, ...] = (),
+) -> Any:
     """Returns a jitted function as it was traced before, or traces it and keeps the result.
 
     Args:
@@ -36,7 +42,7 @@ def keep(program: Program[TrainConfig], name: str, jitted: Any, given: tuple, do
       name: what the function does, for the name of its file.
       jitted: the function.
       given: its arguments, or their shapes.
-      donated: number of the argument that it donates; () for none.
+      donated: numbers of the arguments that it donates.
 
     Returns:
       The function to call or to lower, of the same arguments.

@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 def _kept(program: Any, factor: float, size: int = 3) -> list[float]:
     """Keeps a program that multiplies by a factor, and calls what came back."""
     given = (np.ones(size, np.float32),)
-    return traces.keep(program, "times", jax.jit(lambda x: factor * x), given, ())(*given).tolist()
+    return traces.keep(program, "times", jax.jit(lambda x: factor * x), given)(*given).tolist()
 
 
 def test_a_kept_trace_is_used_by_the_next_run(folder: Path, tiny_config: TrainConfig) -> None:
