@@ -19,6 +19,7 @@ Examples:
   python -m swarmjax.train resume=runs/first
 """
 
+import gc
 import sys
 from collections.abc import Sequence
 
@@ -72,4 +73,6 @@ if __name__ == "__main__":
     from swarmjax.run.settings import TrainConfig
 
     heap.share()
+    # Imports and traces make many objects that stay: looking for garbage takes 0.2 s of a start.
+    gc.set_threshold(100_000)
     sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))
