@@ -19,6 +19,7 @@ Examples:
   python -m swarmjax.train resume=runs/first
 """
 
+import gc
 import sys
 from collections.abc import Sequence
 
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.run import Run
 
         try:
-            Run(settings, stop=stop, display=Display()).train()
+            Run(settings, stop=stop, display=Display(), keep_traces=__name__ == "__main__").train()
         except Exception as error:
             return _failed(error, stop)
         return stop.code or 0
@@ -72,4 +73,6 @@ if __name__ == "__main__":
     from swarmjax.run.settings import TrainConfig
 
     heap.share()
+    # Imports and traces make many objects that stay: looking for garbage takes 0.2 s of a start.
+    gc.set_threshold(100_000)
     sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))

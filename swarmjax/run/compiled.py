@@ -12,6 +12,7 @@ import numpy as np
 
 from swarmjax import provenance
 from swarmjax.curriculum.engine import Schedule
+from swarmjax.run import traces
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training import mesh, seeds
 from swarmjax.training import program as programs
@@ -34,13 +35,16 @@ class Compiled:
     memory_bytes: int
 
 
-def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any) -> Compiled:
+def compile_chunk(
+    program: Program[TrainConfig], schedule: Schedule, state: Any, *, keep_trace: bool = False
+) -> Compiled:
     """Compiles `seeds.chunk` ahead of time.
 
     Args:
       program: the run's program.
       schedule: the curriculum's numbers.
       state: [N] a state, or its shapes from `jax.eval_shape`.
+      keep_trace: whether to keep the traced program for later runs, and to use a kept one.
 
     Returns:
       The program to call.
@@ -48,7 +52,10 @@ def compile_chunk(program: Program[TrainConfig], schedule: Schedule, state: Any)
     began = time.perf_counter()
     groups = programs.groups(program.config, provenance.cores())
     part = jax.eval_shape(partial(seeds.split, parts=groups), state)[0]
-    lowered = mesh.jit_chunk(program).lower(schedule, part, np.int32(1))
+    given, jitted = (schedule, part, np.int32(1)), mesh.jit_chunk(program)
+    if keep_trace:
+        jitted = traces.keep(program, "chunk", jitted, given, donated=(1,))
+    lowered = jitted.lower(*given)
     fixed = program.config.run.deterministic
     call = lowered.compile(programs.compiler_options(deterministic=fixed))
     needed = call.memory_analysis()

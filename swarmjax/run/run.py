@@ -25,6 +25,7 @@ from swarmjax.run import (
     recorder,
     results,
     sentences,
+    traces,
     warm_start,
     weights_and_biases,
 )
@@ -80,6 +81,7 @@ class Run:
         display: Display | None = None,
         loggers: Sequence[Logger] = (),
         on_update: Callable[[Row], object] | None = None,
+        keep_traces: bool = False,
     ) -> None:
         """Prepares a run, but does nothing yet.
 
@@ -89,11 +91,14 @@ class Run:
           display: shows the run; None: nothing is shown.
           loggers: receive the rows, beside the loggers that the config names.
           on_update: called with a copy of each row; it returns True to stop the run.
+          keep_traces: whether to keep traced programs for later runs. Only for a new process: its
+            code is that of the files, whose digest is the key.
         """
         self.settings = settings
         self._stop = stop or Stop()
         self._display = display or Display(quiet=True)
         self._loggers, self._on_update = loggers, on_update or (lambda row: None)
+        self._keep_traces = keep_traces
         self.path, self.update = Path(), 0
         self._kept: Kept | None = None
         self._first, self._seconds, self._earlier_s = 0, 0.0, 0.0
@@ -170,9 +175,10 @@ class Run:
         source = warm_start.read(settings) if self._kept is None else None
         self._display.say("building the arenas ...")
         self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
-        init = jax.jit(mesh.init(self.program))  # traced once, for the shapes and for the state
-        shapes = init.eval_shape(self.schedule)
-        self.state = self._first_state(init, shapes, source)
+        init, given = jax.jit(mesh.init(self.program)), (self.schedule, mesh.lanes(settings))
+        if self._keep_traces:
+            init = traces.keep(self.program, "init", init, given)
+        self.state = self._first_state(init, given, source)
         for sentence in sentences.first(self.program, self.path, self._kept, source):
             self._display.say(sentence)
         if self._has_ended():
@@ -197,18 +203,21 @@ class Run:
         return kept
 
     def _first_state(
-        self, init: Callable[[Schedule], TrainState], shapes: TrainState, source: Kept | None
+        self, init: Any, given: tuple[Schedule, np.ndarray], source: Kept | None
     ) -> TrainState:
         if self._kept is None:
-            state = init(self.schedule)
+            state = init(*given)
             return state if source is None else warm_start.carry(source, state, self.settings)
+        shapes = init.eval_shape(*given)
         return mesh.put(self.program, checkpoint.from_leaves(self._kept.leaves, shapes))
 
     def compile(self) -> None:
         """Compiles the program and claims its memory, so that training cannot run out later."""
         self._display.say("compiling ...")
         self._stop.check()
-        compiled = compile_chunk(self.program, self.schedule, self.state)
+        compiled = compile_chunk(
+            self.program, self.schedule, self.state, keep_trace=self._keep_traces
+        )
         memory.check(self.settings, compiled.memory_bytes)
         began = time.perf_counter()
         self._claim(compiled)

@@ -15,7 +15,6 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from swarmjax.config import ConfigError
-from swarmjax.curriculum.engine import Schedule
 from swarmjax.shards import AXIS
 from swarmjax.sim.physics import PhysicsState
 from swarmjax.training import loop, seeds
@@ -76,22 +75,27 @@ def make(devices: int, axis: str = AXIS) -> Mesh:
     return jax.make_mesh((devices,), (axis,), axis_types=kinds, devices=jax.devices()[:devices])
 
 
-def init(program: Program) -> Callable[[Schedule], TrainState]:
+def init(program: Program) -> Callable[..., TrainState]:
     """Returns a function that starts every seed of a run; `jit` it.
 
     Args:
       program: the compiled program.
 
     Returns:
-      A function from the curriculum's numbers to the states [N] before the first update, spread
-      over devices.
+      A function from the curriculum's numbers and the seeds [N] to the states [N] before the first
+      update, spread over devices. Without seeds, it takes the config's.
     """
     start = partial(seeds.each, partial(loop.init, program))
-    lanes = np.array(program.config.numbers, np.uint32)
+    given = lanes(program.config)
     if program.config.devices > 1:
         layout = _layout(program.config)
         start = _spread(start, layout, (_ALL, layout.lanes), layout.state)
-    return lambda schedule: start(schedule, lanes)
+    return lambda schedule, lanes=given: start(schedule, lanes)
+
+
+def lanes(config: ProgramConfig) -> np.ndarray:
+    """Returns the seeds [N] of a run, as `init` takes them."""
+    return np.array(config.numbers, np.uint32)
 
 
 def jit_chunk(program: Program) -> Any:

@@ -87,7 +87,7 @@ def test_a_program_too_large_is_refused_before_anything_is_written(
 ) -> None:
     run = tmp_path / "run"
     large = compiled.Compiled(lambda *_: pytest.fail("never called"), 1.0, 2 * GIB)
-    monkeypatch.setattr(runs, "compile_chunk", lambda *_: large)
+    monkeypatch.setattr(runs, "compile_chunk", lambda *_, **__: large)
     monkeypatch.setattr(runs.Run, "_first_state", lambda *_: None)
     monkeypatch.setattr(memory, "limit", lambda: 2 * GIB - 1)
     with pytest.raises(ConfigError, match=r"^arenas is 64 .* at most about 56 arenas"):

@@ -47,11 +47,11 @@ def _compiled_once() -> Iterator[None]:
     """Compiles each program once, since no test here is about compiling."""
     compile_chunk, found = runs.compile_chunk, {}
 
-    def look_up(program: Any, *arguments: Any) -> Compiled:
+    def look_up(program: Any, *arguments: Any, **options: Any) -> Compiled:
         config = replace(program.config, run=RunConfig(), resume=None)
         key = (repr(config), program.by_robot)
         if key not in found:
-            found[key] = compile_chunk(program, *arguments)
+            found[key] = compile_chunk(program, *arguments, **options)
         return found[key]
 
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -355,8 +355,8 @@ def _spoil(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     def broken(x: jax.Array) -> jax.Array:
         return x.at[-1].set(np.nan) if x.dtype == np.float32 else x
 
-    def compile_and_spoil(*arguments: Any) -> Any:
-        compiled = compile_chunk(*arguments)
+    def compile_and_spoil(*arguments: Any, **options: Any) -> Any:
+        compiled = compile_chunk(*arguments, **options)
 
         def spoil(schedule: Any, state: Any, n: Any) -> Any:
             state, metrics = compiled.call(schedule, state, n)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from swarmjax.config import build, to_dict
 from swarmjax.exit_codes import INTERRUPTED
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
-from swarmjax.run import checkpoint, directory
+from swarmjax.run import checkpoint, directory, traces
 from swarmjax.run.checkpoint import CheckpointError, digest
 from swarmjax.run.directory import LOCK
 from swarmjax.run.load_settings import load_train
@@ -108,6 +109,28 @@ def test_a_run_directory_holds_what_it_promises(whole: Path) -> None:
 def test_jax_is_not_loaded_before_the_settings_are_read() -> None:
     code = "import sys, swarmjax.train; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_run_with_kept_traces_gives_the_same_bits(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep, kept = traces.keep, []
+
+    def note(program: Any, name: str, *rest: Any, **donated: Any) -> Any:
+        kept.append(name)
+        return keep(program, name, *rest, **donated)
+
+    monkeypatch.setattr(traces, "keep", note)
+    Run(load_train([*TINY, f"run.dir={tmp_path / 'run'}"]), keep_traces=True).train()
+    assert kept == ["init", "chunk"]
+    assert _digest(tmp_path / "run") == _digest(whole)
+
+
+def test_a_run_imports_nothing_heavy_that_it_does_not_use() -> None:
+    heavy = ("mujoco.mjx", "orbax", "scipy", "warp", "brax", "tensorboardX", "wandb", "matplotlib")
+    code = f"import sys, swarmjax.run.run; sys.exit(','.join(set(sys.modules) & set({heavy!r})))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr == "\n"
 
 
 def test_a_run_says_what_steps_the_robots_and_then_that_it_compiles(

@@ -1,0 +1,82 @@
+"""Keeps traced programs between runs, so that a second start need not trace them again.
+
+The key of a compiled program (`compile_cache`) is the traced and lowered program itself, so a start
+with a full cache still traces. Therefore the lowered program is kept in the same directory, under a
+digest of all that a trace depends on: the files of this package, versions, device, JAX's options,
+settings and world. XLA compiles it, or loads it from its cache, as before.
+"""
+
+import contextlib
+import functools
+import hashlib
+import pickle
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax import export
+
+from swarmjax import provenance
+from swarmjax.config import to_dict
+from swarmjax.outputs import replacing
+from swarmjax.run.settings import TrainConfig
+from swarmjax.training.rollout import Program
+
+# Settings on which no trace depends. The seed is an argument of `mesh.init`.
+_NOT_TRACED = ("run", "resume", "init_from", "seed")
+
+
+def keep(
+    program: Program[TrainConfig],
+    name: str,
+    jitted: Any,
+    given: tuple,
+    donated: tuple[int, ...] = (),
+) -> Any:
+    """Returns a jitted function as it was traced before, or traces it and keeps the result.
+
+    Args:
+      program: the run's program, whose settings and world the function closes over.
+      name: what the function does, for the name of its file.
+      jitted: the function.
+      given: its arguments, or their shapes.
+      donated: numbers of the arguments that it donates.
+
+    Returns:
+      The function to call or to lower, of the same arguments.
+    """
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder or not jax.config.jax_enable_compilation_cache or not _can_keep(program):
+        return jitted
+    shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
+    key = hashlib.sha256(f"{_digest(program)} {shapes}".encode()).hexdigest()
+    path = Path(folder) / f"{name}-{key}.trace"
+    try:
+        traced = pickle.loads(zlib.decompress(path.read_bytes()))
+    except Exception:  # missing, or damaged in any way
+        traced = replace(export.export(jitted)(*given), _get_vjp=None)  # a closure
+        with contextlib.suppress(OSError), replacing(path) as file:
+            file.write_bytes(zlib.compress(pickle.dumps(traced)))
+    return jax.jit(traced.call, donate_argnums=donated)
+
+
+def _can_keep(program: Program[TrainConfig]) -> bool:
+    """Returns whether the key covers the whole trace, and the trace is all that a call needs."""
+    config = program.config
+    # Tracing also registers Warp's kernels and Triton's, and an extension may import any file.
+    on_cpu = jax.default_backend() == "cpu" and program.world.physics.engine.impl == "jax"
+    return on_cpu and config.devices == 1 and config.extensions is None
+
+
+@functools.lru_cache(1)  # a world that was traced fills its caches, which changes its bytes
+def _digest(program: Program[TrainConfig]) -> str:
+    """Returns a digest of all that a trace depends on beside its arguments, in hexadecimal."""
+    config = {k: v for k, v in to_dict(program.config).items() if k not in _NOT_TRACED}
+    machine = provenance.versions(), provenance.device(), jax.config.values
+    made = repr((config, program.rows, program.by_robot, machine)).encode()
+    found = hashlib.sha256(made + pickle.dumps(program.world))
+    for path in sorted(Path(provenance.__file__).parent.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
