@@ -166,6 +166,12 @@ class TrainConfig(ProgramConfig):
                 f"budget is {self.budget}, but one update takes arenas x algo.rollout_length = "
                 f"{update} control steps: give at least {update}."
             )
+        most = MAX_COUNT // (self.algo.epochs * self.algo.num_minibatches) * update
+        if self.budget >= most + update:
+            raise ConfigError(
+                f"budget is {self.budget}, but gradient steps are counted in 32 bits: give at most "
+                f"{most}, more arenas, or a longer algo.rollout_length."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

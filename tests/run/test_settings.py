@@ -303,6 +303,19 @@ def test_a_budget_of_one_update_is_enough():
     assert load_train(["budget=4096"]).updates == 1
 
 
+def test_a_budget_of_most_gradient_steps_is_enough():
+    """128 arenas x 32 steps an update, 8 minibatches: (2**31 - 1) // 8 updates."""
+    assert load_train(["budget=1099511623680"]).updates == 268435455
+
+
+def test_a_budget_of_more_gradient_steps_than_32_bits_is_refused():
+    sentence = (
+        "budget is 1099511627776, but gradient steps are counted in 32 bits: give at most "
+        "1099511623680, more arenas, or a longer algo.rollout_length."
+    )
+    assert refusal(load_train, ["budget=1099511627776"]) == sentence
+
+
 def test_a_training_without_stages_is_refused():
     assert refusal(build, TrainConfig, {"stage": []}) == "stage is []: give at least one stage."
 
