@@ -187,10 +187,10 @@ class SimConfig(Section):
         "body, on wheels only with impl=warp; auto: swarm where available",
     )
     max_robots: int | None = setting(
-        None, "robots to compile for; null: 5, or as many as the stages need", 1, 100
+        None, "robots to compile for; null: 5, or as many as the stages need", 1, 1024
     )
     max_obstacles: int | None = setting(
-        None, "obstacles to compile for; null: 4, or as many as the stages need", 0, 112
+        None, "obstacles to compile for; null: 4, or as many as the stages need", 0, 256
     )
     substeps: int | None = setting(
         None, "physics steps per control step; null: the body's default", 1, 1000

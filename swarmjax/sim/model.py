@@ -19,7 +19,7 @@ from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED
 
 WALL_HALF_THICKNESS = 0.05  # m; a robot sinks at most 4 mm into a wall, so none gets through
-WALL_HALF_LENGTH = 2.5  # m; longer than half the largest arena (4 m)
+WALL_HALF_LENGTH = 20.5  # m; longer than half the largest arena (40 m)
 HALF_HEIGHT = 0.05  # m; walls and obstacles are 0.1 m high (Webots RectangleArena)
 WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}

@@ -12,7 +12,7 @@ from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, about, section, setting, show
 from swarmjax.sim.config import SimConfig
 from swarmjax.task import fixed_level, maps
-from swarmjax.task.layouts import LAYOUTS
+from swarmjax.task.layouts import LAYOUTS, plots
 from swarmjax.task.layouts.drawing import Kind
 from swarmjax.task.layouts.site import NUMBERS, ArenaLayout
 from swarmjax.task.placement import UNITS
@@ -27,7 +27,8 @@ _DISC_PER_HULL, _PASSAGE_PER_HULL = 4.05, 2.7  # lengths per hull radius; as for
 FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
-_MOST_OBSTACLES = 112
+# Squares of lengths fit an int32, and points suffice, up to these numbers; plots go further.
+_MOST_OBSTACLES, _MOST_ROBOTS, _LARGEST_SIDE = 112, 100, 4.0
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 _Length = float | tuple[float, float] | None
 
@@ -74,9 +75,9 @@ class StageConfig(Section):
     """One stage: number of robots, arena size and obstacles."""
 
     name: str = field(metadata=about("name of the stage: the name of its file"))
-    robots: int = field(metadata=about("active robots", 1, 100))
+    robots: int = field(metadata=about("active robots", 1, 1024))
     side: float | tuple[float, float] = field(
-        metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 4.0)
+        metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 40.0)
     )
     distance: _Length = setting(
         None,
@@ -84,8 +85,10 @@ class StageConfig(Section):
         0.05,
         50.0,
     )
-    obstacles: int = setting(0, "obstacles; set by a layout", 0, _MOST_OBSTACLES)
-    obstacle_size: float = setting(0.10, "edge of the square boxes of a random level, m", 0.02, 0.3)
+    obstacles: int = setting(0, "obstacles; set by a layout but plots", 0, 256)
+    obstacle_size: float = setting(
+        0.10, "edge of the square boxes of a random level, or on plots, m", 0.02, 0.3
+    )
     level: str = setting(
         "random",
         "random: new in every episode; fixed: always the same; map: the walls of map, with "
@@ -124,6 +127,8 @@ class StageConfig(Section):
             )
         if not re.fullmatch(r"[\w-]+", self.name):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
+        if self.level != "plots":
+            self._check_number()
         self._check_fixed()
         self._check_keys(LAYOUTS.get(self.level))
         if self.level in LAYOUTS:
@@ -136,6 +141,16 @@ class StageConfig(Section):
                 f"obstacles={self.obstacles}, obstacle_size={show(self.obstacle_size)}: "
                 f"give at least {math.ceil(100 * least) / 100}."
             )
+
+    def _check_number(self) -> None:
+        """Refuses numbers that are too large for levels in which everything is placed in turn."""
+        most = {"robots": _MOST_ROBOTS, "side": _LARGEST_SIDE, "obstacles": _MOST_OBSTACLES}
+        for key, limit in most.items():
+            if (self.sides[1] if key == "side" else getattr(self, key)) > limit:
+                raise ConfigError(
+                    f"{key} is {show(getattr(self, key))}, but level is {self.level}: give at most "
+                    f"{limit:g}, or level=plots."
+                )
 
     def _check_fixed(self) -> None:
         if self.layout == "fence" and self.level != "fixed":
@@ -199,13 +214,19 @@ class StageConfig(Section):
                 f"robots is {self.robots}, but level={self.level} has room for "
                 f"{layout.most_robots}: give at most that."
             )
+        if self.level == "plots" and self.sides[0] < (least := smallest_plots(self)):
+            raise ConfigError(
+                f"side is {show(self.side)}, too small for robots={self.robots} and "
+                f"obstacles={self.obstacles} on plots: give at least {math.ceil(10 * least) / 10}."
+            )
 
     @property
     def kind(self) -> Kind | None:
         """The part of the layout that is compiled in; None without a layout."""
         if self.level not in LAYOUTS:
             return None
-        return Kind(self.level, self.cells or 0, self.breadth is not None)
+        cells = self.obstacles if self.level == "plots" else self.cells or 0
+        return Kind(self.level, cells, self.breadth is not None)
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
@@ -213,6 +234,8 @@ class StageConfig(Section):
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
+        if self.level == "plots":
+            ends[NUMBERS.index("width")] = _ends(self.obstacle_size)
         return self.kind, {
             "side": _whole(self.side),
             "breadth": [0, 0] if self.breadth is None else _whole(self.breadth),
@@ -266,6 +289,12 @@ def smallest_side(stage: StageConfig, hull: float = epuck.HULL_RADIUS) -> float:
     if stage.level != "fixed":  # an extension's drawing starts from a random level
         area = max(area, stage.obstacles * pitch**2 / FILLING)
     return free + math.sqrt(area)
+
+
+def smallest_plots(stage: StageConfig) -> float:
+    """Returns the smallest side, m, of an arena whose plots hold e-pucks and boxes."""
+    box = stage.obstacle_size + PASSAGE if stage.obstacles else 0.0
+    return plots.along(stage.robots, stage.obstacles) * max(DISC, box)
 
 
 def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:

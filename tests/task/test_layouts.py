@@ -15,7 +15,7 @@ from swarmjax.task import level, room, stage_files
 from swarmjax.task import stage as task_stage
 from swarmjax.task.layouts import LAYOUTS, maze
 from swarmjax.task.level import Level, Spacing
-from swarmjax.task.stage_config import StageConfig
+from swarmjax.task.stage_config import PASSAGE, StageConfig
 from tests.sentences import refusal
 
 HULL, REACH = 0.037, 0.05  # m; radii of an e-puck and its zone of arrival
@@ -31,11 +31,12 @@ FAR: dict[str, dict[str, Any]] = {
     "blocks": {"cells": 6, "side": 0.9, "robots": 5},
     "circle": {"robots": 20},
     "crowd": {"robots": 44, "side": 1.3},
+    "plots": {"robots": 1024, "side": 17.2, "obstacles": 256},
 }
 
 
 # Crowds and circles need robots that move at once; blocks may leave no way to pass each other.
-UNPLANNED = {"crowd", "circle", "blocks"}
+UNPLANNED = {"crowd", "circle", "blocks", "plots"}
 
 
 def _stage(name: str, **changed: Any) -> StageConfig:
@@ -95,6 +96,22 @@ def test_targets_have_room_for_a_robot_each(name: str) -> None:
 def test_no_robot_starts_where_it_has_arrived(name: str) -> None:
     for drawn in _levels(name):
         assert np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1).min() > REACH
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_plots_keep_passages_between_boxes_and_targets_apart(*, far: bool) -> None:
+    for drawn in _levels("plots", 5, far=far):
+        boxes = drawn.obstacle[:, :2]
+        assert _least(boxes) >= drawn.obstacle[0, 3] * 2 + PASSAGE
+        assert _least(drawn.target) >= 0.25 - ROUNDING
+        assert _from_boxes(drawn, drawn.target).min() >= 0.15
+
+
+def test_plots_use_the_whole_arena() -> None:
+    start = np.concatenate([drawn.start[:, :2] / drawn.side for drawn in _levels("plots")])
+    counts = np.histogram2d(*start.T, bins=4, range=[(-0.5, 0.5)] * 2)[0]
+    # 500 expected in each square; the standard deviation of such a count is 22.
+    np.testing.assert_allclose(counts, 500, atol=100)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -381,6 +398,13 @@ def _change(name: str, **changed: Any) -> None:
             {"radius": 0.15},
             "stage world_circle: level=circle has no room for 16 robots, ",
         ),
+        (
+            "plots",
+            {"side": 3.0},
+            "side is 3, too small for robots=200 and obstacles=50 on plots: give at least 4.4.",
+        ),
+        ("crowd", {"robots": 101}, "robots is 101, but level is crowd: give at most 100, or level"),
+        ("maze", {"side": 5.0}, "side is 5, but level is maze: give at most 4, or level=plots."),
     ],
 )
 def test_refuses_numbers_without_room(name: str, changed: dict[str, Any], said: str) -> None:

@@ -113,7 +113,7 @@ def test_refuses_too_many_walls() -> None:
     [
         (LETTERS, 1, "robots is 1, but map has letters for 2 and no areas S and T: give 2."),
         (LETTERS, 3, "robots is 3, but map has letters for 2 and no areas S and T: give 2."),
-        ("aAST", 0, "robots is 0: give 1 to 100"),
+        ("aAST", 0, "robots is 0: give 1 to 1024"),
     ],
 )
 def test_refuses_robots(text: str, robots: int, said: str) -> None:

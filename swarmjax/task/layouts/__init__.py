@@ -5,7 +5,7 @@ layouts share. `drawing.py` turns a layout into a level. Lengths are whole units
 NumPy and JAX draw the same bits. The package may import `placement.py` and `sim.noise`.
 """
 
-from swarmjax.task.layouts import barriers, blocks, maze, open_floor
+from swarmjax.task.layouts import barriers, blocks, maze, open_floor, plots
 from swarmjax.task.layouts.site import ArenaLayout
 
 LAYOUTS: dict[str, ArenaLayout] = {
@@ -18,4 +18,5 @@ LAYOUTS: dict[str, ArenaLayout] = {
     "blocks": blocks.BLOCKS,
     "circle": open_floor.CIRCLE,
     "crowd": open_floor.CROWD,
+    "plots": plots.PLOTS,
 }

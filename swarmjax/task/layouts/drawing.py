@@ -38,7 +38,7 @@ class Kind(NamedTuple):
 
     Attributes:
       name: name in `LAYOUTS`.
-      cells: number of cells along a side of a maze; 0 for other layouts.
+      cells: number of cells along a side of a maze, or of boxes on plots; 0 for other layouts.
       narrow: whether an arena may be narrower than it is long, with bars of wall beside it.
     """
 

@@ -17,7 +17,7 @@ class Numbers(NamedTuple):
 
     Attributes:
       gap: free width of a door or a corridor.
-      width: free width of a trap, or of a corridor at its bay.
+      width: free width of a trap, or of a corridor at its bay, or edge of a box on a plot.
       depth: depth of a trap.
       length: length of a fence, or of a bay along its corridor.
       radius: radius of the circle on which robots start.
@@ -41,7 +41,7 @@ class Site(NamedTuple):
     Attributes:
       half: [2] half of the arena's extent along x and y.
       numbers: numbers of this level.
-      cells: number of cells along a side of a maze; 0 for other layouts.
+      cells: number of cells along a side of a maze, or of boxes on plots; 0 for other layouts.
       present: [R] whether the robot is present.
       hull: radius of the robots.
       clear: least distance between a robot's centre and a wall at the start.
@@ -82,7 +82,7 @@ class ArenaLayout(NamedTuple):
       draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
       uniforms: takes a number of robots and cells, and returns how many uniform numbers the layout
         takes.
-      walls: takes a number of cells (of a maze), and returns the largest number of walls.
+      walls: takes the number of cells of a site, and returns the largest number of walls.
       reads: those `NUMBERS` of a stage that the layout uses, or `cells`.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
