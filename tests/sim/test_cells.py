@@ -119,13 +119,13 @@ def test_cells_list_the_contacts_of_all_pairs_in_thousands_of_arenas(scene: Scen
 
 
 def _accelerations(push_apart: Any, width: float) -> np.ndarray:
-    """Returns accelerations [A, R, 3] of 80 robots in squares of this width, m."""
+    """Returns accelerations [A, R, 3] of 100 robots in squares of this width, m."""
     random = np.random.default_rng(5)
-    place = random.uniform(-0.5, 0.5, (3, 80, 3)) * [width, width, 6.0]
-    rate, free, before = random.normal(size=(3, 3, 80, 3))
-    numbers = random.uniform(5.0, 9.0, (3, 3, 80))
+    place = random.uniform(-0.5, 0.5, (3, 100, 3)) * [width, width, 6.0]
+    rate, free, before = random.normal(size=(3, 3, 100, 3))
+    numbers = random.uniform(5.0, 9.0, (3, 3, 100))
     given = map(jnp.float32, (place, rate, free, before, *numbers))
-    index, friction = np.zeros((1, 80), int), np.float32(0.5)
+    index, friction = np.zeros((1, 100), int), np.float32(0.5)
     spring = np.array([0.02, 1.0]), np.array([0.9, 0.95, 0.001, 0.5, 2.0])
     discs = Discs(float(RADIUS), 0.016, 60, index[0], index, *spring, friction, push_apart)
     box = jnp.array([[0.05, 0.02, 0.4, 0.05, 0.05]], jnp.float32)
@@ -137,9 +137,9 @@ def _accelerations(push_apart: Any, width: float) -> np.ndarray:
 def test_solvers_return_the_same_bits_with_cells(
     push_apart: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with_cells = _accelerations(push_apart, 0.8)
-    monkeypatch.setattr(contacts_warp, "MANY", 81)
-    np.testing.assert_array_equal(with_cells, _accelerations(push_apart, 0.8))
+    with_cells = _accelerations(push_apart, 0.9)
+    monkeypatch.setattr(contacts_warp, "MANY", 101)
+    np.testing.assert_array_equal(with_cells, _accelerations(push_apart, 0.9))
     assert np.isfinite(with_cells).all()
 
 

@@ -29,7 +29,7 @@ from swarmjax.sim.fast import discs as sim_discs
 from swarmjax.sim.fast.arenas_warp import over_arenas
 from swarmjax.sim.fast.discs import DiscRobots, Discs
 
-MANY = 64  # robots; from here on cells save time
+MANY = 100  # robots; on two cores, cells take less time from about here on
 _BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
 # Edge of a cell in radii: 5 % more than a hull's diameter, for rounding.
 CELL = wp.constant(2.1)
