@@ -32,22 +32,25 @@ def _load(
     stage: StageConfig | None = None,
     friction: float = 0.0,
 ) -> physics.Physics:
-    box = StageConfig(name="box", robots=ROBOTS, side=1.3, obstacles=obstacles, obstacle_size=0.1)
-    stage = box if stage is None else stage
-    sim = SimConfig(impl=impl, solver=solver, max_robots=ROBOTS, max_obstacles=obstacles)
+    if stage is None:
+        box = {"obstacles": obstacles, "obstacle_size": 0.1}
+        stage = StageConfig(name="box", robots=ROBOTS, side=1.3, **box)
+    sim = SimConfig(impl=impl, solver=solver, max_robots=stage.robots, max_obstacles=obstacles)
     robot = RobotConfig(body=body, hull_friction=friction)
     settings = TrainConfig(stage=(stage,), robot=robot, sim=sim, arenas=ARENAS, budget=10_000)
     return programs.load_world(settings).physics
 
 
-def _crowds(side: float) -> tuple[np.ndarray, np.ndarray]:
+def _crowds(
+    side: float, arenas: int = ARENAS, robots: int = ROBOTS
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns random poses [A, R, 3] of robots that overlap each other, and their wheel speeds.
 
     At a side of 0.5 m a third of the robots also overlap a wall or the box, and at 0.16 m most do.
     """
     random = np.random.default_rng(3)
-    pose = random.uniform(-0.5, 0.5, (ARENAS, ROBOTS, 3)) * [side, side, 6.0]
-    action = random.uniform(-1.0, 1.0, (ARENAS, ROBOTS, 2))
+    pose = random.uniform(-0.5, 0.5, (arenas, robots, 3)) * [side, side, 6.0]
+    action = random.uniform(-1.0, 1.0, (arenas, robots, 2))
     robot = drive.from_config(RobotConfig())
     wheels = drive.wheel_speeds(drive.command(action, robot, np), robot, np)
     return pose.astype(np.float32), wheels.astype(np.float32)
@@ -81,7 +84,7 @@ def _in_c(
     MuJoCo C computes in float64, and its solver iterates until it converges.
     """
     count = physics_substeps(robot, None)
-    size = model.ArenaSize(ROBOTS, len(box), 0.05)
+    size = model.ArenaSize(len(pose), len(box), 0.05)
     spec = model.build(robot, size, STEP / count)
     spec.option.iterations, spec.option.tolerance = 100, 1e-14
     spec.option.ls_iterations, spec.option.ls_tolerance = 100, 1e-6
@@ -236,6 +239,16 @@ def _beside_the_box(pose: np.ndarray) -> np.ndarray:
     moved = pose.copy()
     moved[..., :2] = np.where(deep[..., None], [x, y] + out @ turn.T, pose[..., :2])
     return moved
+
+
+def test_a_hundred_robots_push_each_other_apart_as_in_c() -> None:
+    stage = StageConfig(name="many", robots=100, side=4.0, obstacles=1, obstacle_size=0.1)
+    (pose, wheels), side = _crowds(0.7, 2, stage.robots), 0.7
+    found = _on_device(_load("warp", "planar", "swarm", stage=stage), side, pose, wheels)
+    each = [_in_c(RobotConfig(), side, p, w) for p, w in zip(pose, wheels, strict=True)]
+    assert min(pairs for _, pairs in each) >= 160
+    # The largest error was 1.3e-6.
+    assert _off(found, np.array([rate for rate, _ in each])) <= 2.6e-6
 
 
 @pytest.mark.parametrize("side", PAIRS)

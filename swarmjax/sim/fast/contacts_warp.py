@@ -1,8 +1,12 @@
-"""The contacts of planar robots in Warp, and the kernel around a solver of their forces.
+"""The contacts of planar robots in Warp, and the kernels around a solver of their forces.
 
 A kernel has one thread per arena. A thread lists the contacts of its arena, and solves for their
 forces (`planar_warp`, and `rubbing_warp` with friction). In a kernel that XLA unrolls over all
 possible contacts, most of the work would go to contacts that do not exist.
+
+A thread that compares all pairs of many robots would take too long. For `MANY` robots or more, one
+thread per obstacle, wall and robot lists the contacts with robots in the cells around it
+(`cells_warp`), in the same order. The thread of the arena then only solves for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
@@ -13,19 +17,22 @@ JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA 
 import functools
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import warp as wp
 from jax import Array
-from jax.custom_batching import custom_vmap
 
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.engine import ROWS_PER_ROBOT
+from swarmjax.sim.fast import cells_warp
 from swarmjax.sim.fast import discs as sim_discs
+from swarmjax.sim.fast.arenas_warp import over_arenas
 from swarmjax.sim.fast.discs import DiscRobots, Discs
 
+MANY = 100  # robots; on two cores, cells take less time from about here on
 _BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
+# Edge of a cell in radii: 5 % more than a hull's diameter, for rounding.
+CELL = wp.constant(2.1)
 _DEEPEST = wp.constant(sim_discs.DEEPEST)
 _WALLS = wp.constant(sim_model.WALLS)
 _THICKNESS = wp.constant(sim_model.WALL_HALF_THICKNESS)
@@ -33,14 +40,14 @@ _LENGTH = wp.constant(sim_model.WALL_HALF_LENGTH)
 
 
 def launch(
-    kernel: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
+    kernels: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
 ) -> Array:
     """Computes the accelerations of one arena's robots, including contacts.
 
     `vmap` adds arenas to the same kernel, for any axes.
 
     Args:
-      kernel: result of `kernel_of`.
+      kernels: result of `kernels_of`.
       rows: rows of `WarpArena.contact` that its solver uses.
       discs: constants.
       robots: their state, and their accelerations without contacts.
@@ -50,37 +57,11 @@ def launch(
     Returns:
       [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
-    return over_arenas(functools.partial(_launch, kernel, rows, discs), robots, side, obstacle)
-
-
-def over_arenas(solve: Any, *inputs: Any) -> Array:
-    """Calls a function of many arenas for one arena; each `vmap` axis becomes more arenas.
-
-    Args:
-      solve: takes the inputs with a leading arena axis, and returns an array with that axis.
-      *inputs: arrays of one arena, or trees of them.
-
-    Returns:
-      The result for the arena.
-    """
-    many = custom_vmap(solve)
-
-    @many.def_vmap
-    def _(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
-        def widen(x: Array, has: bool) -> Array:
-            return x if has else jnp.broadcast_to(x, (size, *x.shape))
-
-        whole = jax.tree.map(widen, given, tuple(batched))
-        shape = jax.tree.leaves(whole)[0].shape[:2]  # [size, arenas]
-        arenas = shape[0] * shape[1]  # `reshape` cannot infer this number if there are no obstacles
-        result = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
-        return result.reshape(*shape, *result.shape[1:]), True
-
-    return many(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))[0]
+    return over_arenas(functools.partial(_launch, kernels, rows, discs), robots, side, obstacle)
 
 
 def _launch(
-    kernel: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
+    kernels: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
 ) -> Array:
     """Computes the accelerations [A, R, 3] of many arenas."""
     arenas, count = robots.mobility.shape
@@ -91,10 +72,54 @@ def _launch(
     numbers = np.array([*hull, discs.sweeps], np.float32)
     body = jnp.stack([robots.mobility, robots.weight, robots.agility], axis=-1)
     dynamics = jnp.stack([robots.free, robots.before, body], axis=1)
-    call = wp.jax_kernel(kernel, num_outputs=2, block_dim=_BLOCK)
+    make = functools.partial(wp.jax_kernel, num_outputs=2, block_dim=_BLOCK)
     shapes = {"contact": (rows, contacts, arenas), "total": (arenas, count)}
-    given = robots.place, robots.rate, dynamics, side, obstacle, jnp.asarray(numbers)
-    return call(*given, launch_dims=arenas, output_dims=shapes)[1]
+    given, (few, many) = (side, obstacle, jnp.asarray(numbers)), kernels
+    if count < MANY:
+        moving = robots.place, robots.rate, dynamics
+        return make(few)(*moving, *given, launch_dims=arenas, output_dims=shapes)[1]
+    listed, contact = list_by_cells(shapes["contact"], discs.radius, robots.place, *given)
+    motion = jnp.concatenate([robots.place[:, None], robots.rate[:, None], dynamics], axis=1)
+    call = make(many, in_out_argnames=["contact"])
+    given = motion, *given, jnp.minimum(listed, contacts), contact
+    total = call(*given, launch_dims=arenas, output_dims={"total": shapes["total"]})[1]
+    # An arena with more contacts than it has room for is broken.
+    return jnp.where((listed > contacts)[:, None, None], jnp.nan, total)
+
+
+def list_by_cells(
+    shape: tuple[int, int, int],
+    radius: float,
+    place: Array,
+    side: Array,
+    obstacle: Array,
+    numbers: Array,
+) -> tuple[Array, Array]:
+    """Lists the contacts of many arenas as `_list_contacts` does, by looking into cells.
+
+    Args:
+      shape: N, K, A.
+      radius: radius of the hulls, m.
+      place: [A, R, 3] x (m), y (m), yaw (rad).
+      side: [A] m.
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      numbers: as in `WarpArena`.
+
+    Returns:
+      [A] number of contacts, which may be larger than K, and [N, K, A, 4] their rows 0 and 1, as in
+      `WarpArena`.
+    """
+    arenas, robots = place.shape[:2]
+    owners, width = (arenas, obstacle.shape[1] + sim_model.WALLS + robots), CELL * radius
+    call = wp.jax_kernel(_list_near, num_outputs=2, in_out_argnames=["count"])
+    given = place, side, obstacle, numbers, *cells_warp.chain(place, width)
+
+    def run(start: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
+        return call(*given, start, launch_dims=owners, output_dims={"contact": shape})
+
+    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # no room to list any
+    end = jnp.cumsum(count, axis=1)
+    return end[:, -1], run(end - count, shape)[1]
 
 
 @wp.struct
@@ -132,15 +157,15 @@ class WarpArena:
     index: int
 
 
-def kernel_of(solve: Any) -> Any:
-    """Makes a kernel that computes the accelerations of arenas.
+def kernels_of(solve: Any) -> Any:
+    """Makes two kernels that compute the accelerations of arenas.
 
     Args:
       solve: a Warp function that takes a `WarpArena`, whose `total` is `free`, and its number of
         contacts, and sets `total`.
 
     Returns:
-      The kernel, for `launch`.
+      The kernels, for `launch`: one lists the contacts, the other takes them from a list.
     """
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -173,7 +198,25 @@ def kernel_of(solve: Any) -> Any:
         if count > 0:
             solve(arena, count)
 
-    return push_apart
+    @wp.kernel(enable_backward=False, module="unique")
+    def push_listed_apart(
+        motion: wp.array3d[wp.vec3],
+        side: wp.array[float],
+        obstacle: wp.array3d[float],
+        numbers: wp.array[float],
+        listed: wp.array[int],
+        contact: wp.array3d[wp.vec4],
+        total: wp.array2d[wp.vec3],
+    ) -> None:
+        i = wp.tid()
+        place, rate, free, before = motion[i, 0], motion[i, 1], motion[i, 2], motion[i, 3]
+        body, edge, box, result = motion[i, 4], side[i], obstacle[i], total[i]
+        arena = WarpArena(place, rate, free, before, body, edge, box, numbers, contact, result, i)
+        let_go(arena)
+        if listed[i] > 0:
+            solve(arena, listed[i])
+
+    return push_apart, push_listed_apart
 
 
 @wp.func
@@ -207,6 +250,92 @@ class WarpBox:
     sin: float
     half_x: float
     half_y: float
+
+
+@wp.kernel(enable_backward=False)
+def _list_near(
+    place: wp.array2d[wp.vec3],
+    side: wp.array[float],
+    obstacle: wp.array3d[float],
+    numbers: wp.array[float],
+    first: wp.array3d[int],
+    after: wp.array2d[int],
+    count: wp.array2d[int],
+    contact: wp.array3d[wp.vec4],
+) -> None:
+    """Lists the contacts of an obstacle, wall or robot with robots, from index `count` on.
+
+    Sets `count` to their number. A robot has contacts only with the robots after it.
+    """
+    i, owner = wp.tid()
+    arena = WarpArena()
+    arena.index = i
+    arena.place = place[i]
+    arena.side = side[i]
+    arena.obstacle = obstacle[i]
+    arena.numbers = numbers
+    arena.contact = contact
+    fixtures, across, width = obstacle.shape[1] + _WALLS, first.shape[1], CELL * numbers[0]
+    start = wp.int32(count[i, owner])
+    box = _box_of(arena, owner, width)
+    reach_x = wp.abs(box.cos) * box.half_x + wp.abs(box.sin) * box.half_y + 0.5 * width
+    reach_y = wp.abs(box.sin) * box.half_x + wp.abs(box.cos) * box.half_y + 0.5 * width
+    x, y = cells_warp.cell_at(box.x - reach_x, width), cells_warp.cell_at(box.y - reach_y, width)
+    # No more columns and rows than the grid has, or a robot would be found twice.
+    end_x = wp.min(cells_warp.cell_at(box.x + reach_x, width) + 1, x + across)
+    end_y = wp.min(cells_warp.cell_at(box.y + reach_y, width) + 1, y + across)
+    known = wp.int32(0)
+    for column in range(x, end_x):
+        for row in range(y, end_y):
+            robot = wp.int32(first[i, column & (across - 1), row & (across - 1)])
+            while robot >= 0:
+                known = _list_robot(arena, start, known, box, owner - fixtures, robot)
+                robot = after[i, robot]
+    count[i, owner] = known
+
+
+@wp.func
+def _list_robot(
+    arena: WarpArena, start: int, count: int, box: WarpBox, owner: int, robot: int
+) -> int:
+    """Lists a robot's contact with a robot before it, or with a box if there is no `owner`.
+
+    The contacts from `start` on are in the order of the robots. Returns their new number.
+    """
+    gap, first, second = wp.vec3(), robot, wp.int32(-1)
+    if owner < 0:
+        gap = _from_box(arena.place[robot], box, arena.numbers[0])
+    elif owner < robot:
+        gap, first, second = _from_disc(arena, owner, robot), owner, robot
+    if not (gap[2] < 0.0):
+        return count
+    k = start + count
+    if k < arena.contact.shape[1]:
+        while k > start and _last_robot(arena, k - 1) > robot:
+            arena.contact[0, k, arena.index] = arena.contact[0, k - 1, arena.index]
+            arena.contact[1, k, arena.index] = arena.contact[1, k - 1, arena.index]
+            k -= 1
+        _list_gap(arena, k, gap, first, second)
+    return count + 1
+
+
+@wp.func
+def _last_robot(arena: WarpArena, k: int) -> int:
+    """Returns the later robot of a contact."""
+    sides = sides_of(arena.contact[1, k, arena.index])
+    return wp.max(sides[0], sides[1])
+
+
+@wp.func
+def _box_of(arena: WarpArena, owner: int, width: float) -> WarpBox:
+    """Returns an obstacle, a wall, or a square of this width around a robot, in this order."""
+    obstacles = arena.obstacle.shape[0]
+    if owner < obstacles:
+        return _obstacle_box(arena, owner)
+    if owner < obstacles + _WALLS:
+        return _wall_box(arena.side, owner - obstacles)
+    place = arena.place[owner - obstacles - _WALLS]
+    return WarpBox(place[0], place[1], 1.0, 0.0, 0.5 * width, 0.5 * width)
 
 
 @wp.func

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import warp as wp
 from jax import Array
 
-from swarmjax.sim.fast.contacts_warp import over_arenas
+from swarmjax.sim.fast.arenas_warp import over_arenas
 
 _FAR = wp.constant(1e30)  # m; stands for inf inside the kernels
 _OPEN, _SETTLED = wp.constant(0), wp.constant(1)

@@ -90,4 +90,4 @@ def _sweep(arena: WarpArena, count: int) -> bool:
     return change > _TOLERANCE * largest
 
 
-push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernel_of(_solve), 2)
+push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernels_of(_solve), 2)

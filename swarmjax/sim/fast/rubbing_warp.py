@@ -242,4 +242,4 @@ def _leap(arena: WarpArena, count: int, index: int, weights: wp.vec2) -> None:
         _push(arena, arena.contact[0, k, arena.index], sides, more)
 
 
-push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernel_of(_solve), _PAST + KEPT)
+push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernels_of(_solve), _PAST + KEPT)

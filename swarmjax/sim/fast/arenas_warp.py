@@ -1,0 +1,34 @@
+"""Makes kernels in Warp, which compute many arenas, work under `vmap`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.custom_batching import custom_vmap
+
+
+def over_arenas(solve: Any, *inputs: Any) -> Array:
+    """Calls a function of many arenas for one arena; each `vmap` axis becomes more arenas.
+
+    Args:
+      solve: takes the inputs with a leading arena axis, and returns an array with that axis.
+      *inputs: arrays of one arena, or trees of them.
+
+    Returns:
+      The result for the arena.
+    """
+    many = custom_vmap(solve)
+
+    @many.def_vmap
+    def _(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
+        def widen(x: Array, has: bool) -> Array:
+            return x if has else jnp.broadcast_to(x, (size, *x.shape))
+
+        whole = jax.tree.map(widen, given, tuple(batched))
+        shape = jax.tree.leaves(whole)[0].shape[:2]  # [size, arenas]
+        arenas = shape[0] * shape[1]  # `reshape` cannot infer this number if there are no obstacles
+        result = many(*jax.tree.map(lambda x: x.reshape(arenas, *x.shape[2:]), whole))
+        return result.reshape(*shape, *result.shape[1:]), True
+
+    return many(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))[0]

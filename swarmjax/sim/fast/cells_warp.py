@@ -1,0 +1,54 @@
+"""A grid of cells in Warp, which finds the robots near a place without looking at all robots.
+
+A robot is in the cell of its centre. The robots of a cell form a chain of any length, so no cell
+overflows. The grid repeats: after its last cell along x or y its first one follows. It thus has a
+cell for every place in the plane, also for parked robots and for those outside the walls.
+"""
+
+import math
+
+import jax.numpy as jnp
+import warp as wp
+from jax import Array
+
+# Cells; all places further away from the origin are in the same row or column of cells. Up to here
+# float32 rounds to less than 1 % of a cell.
+_FAR = wp.constant(32768.0)
+_PER_ROBOT = 2.0  # least number of cells along each axis, per root of the number of robots
+
+
+def chain(place: Array, width: float) -> tuple[Array, Array]:
+    """Puts the robots of many arenas into cells.
+
+    Args:
+      place: [A, R, 3] x (m), y (m), yaw (rad).
+      width: edge of a cell, m.
+
+    Returns:
+      [A, C, C] the first robot of each cell, and [A, R] the robot that follows each robot in its
+      cell; -1 for none. C is a power of two. The order in a cell may differ from run to run.
+    """
+    arenas, robots = place.shape[:2]
+    across = 2 ** math.ceil(math.log2(_PER_ROBOT * math.sqrt(robots)))
+    empty = jnp.full((arenas, across, across), -1, jnp.int32)
+    call = wp.jax_kernel(_enter, num_outputs=2, in_out_argnames=["first"])
+    size = (arenas, robots)
+    return call(place, width, empty, launch_dims=size, output_dims={"after": size})
+
+
+@wp.kernel(enable_backward=False)
+def _enter(
+    place: wp.array2d[wp.vec3], width: float, first: wp.array3d[int], after: wp.array2d[int]
+) -> None:
+    """Puts a robot into its cell, before the robots that are there."""
+    i, robot = wp.tid()
+    here, last = place[i, robot], first.shape[1] - 1
+    x, y = cell_at(here[0], width) & last, cell_at(here[1], width) & last
+    after[i, robot] = wp.atomic_exch(first, i, x, y, robot)
+
+
+@wp.func
+def cell_at(x: float, width: float) -> int:
+    """Returns the cell along an axis, before the grid repeats; NaN has a cell, too."""
+    across = x / width
+    return int(wp.floor(wp.where(across > -_FAR, wp.min(across, _FAR), -_FAR)))
