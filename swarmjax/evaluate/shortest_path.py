@@ -13,6 +13,7 @@ import numpy as np
 
 CORNER = 4  # points for each round corner
 GOAL = 24  # points on the circle around a target, used if the straight way to its centre is blocked
+_DETOUR = 0.2  # m; length by which a way is first allowed to exceed the straight line
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 
@@ -47,7 +48,7 @@ class _Points(NamedTuple):
 
 
 class _Arena(NamedTuple):
-    """The data that the robots of an arena share.
+    """The part of an arena in which a path is sought.
 
     Attributes:
       inside: Half edge of the square within which the disc's centre stays, m.
@@ -92,11 +93,31 @@ def shortest(
     walled = (length > 0.0) & ~_within(ends, inside[:, None])
     bent = barred.any(axis=-1) | walled
     for each in np.flatnonzero(bent.any(axis=-1)):
-        arena = _arena(float(inside[each]), obstacle[each], hull_radius)
         for robot in np.flatnonzero(bent[each]):
-            length[each, robot] = _way(
-                arena, start[each, robot], target[each, robot], target_radius
-            )
+            ends = start[each, robot], target[each, robot], target_radius
+            length[each, robot] = _near_way(float(inside[each]), obstacle[each], hull_radius, *ends)
+    return length
+
+
+def _near_way(
+    inside: float,
+    obstacle: np.ndarray,
+    hull: float,
+    start: np.ndarray,
+    target: np.ndarray,
+    reach: float,
+) -> float:
+    """Computes the length of the shortest path of one robot past obstacles [M, 5], m.
+
+    A path stays within an ellipse around its ends. If the shortest path past the obstacles in an
+    ellipse is short enough to stay in it, it meets no others.
+    """
+    apart = [np.linalg.norm(obstacle[:, :2] - end, axis=-1) for end in (start, target)]
+    least = apart[0] + apart[1] - 2.0 * (np.hypot(*obstacle[:, 3:].T) + hull)
+    length, most = float(np.linalg.norm(target - start)) + _DETOUR, 0.0
+    while most < length + reach < math.inf:
+        most = length + reach
+        length = _way(_arena(inside, obstacle[least <= most], hull), start, target, reach)
     return length
 
 

@@ -175,6 +175,14 @@ def test_ways_through_a_maze_are_those_of_a_grid(seed: int) -> None:
         assert expected <= 1.027 * found + 4 * CELL
 
 
+def test_a_wall_far_from_the_straight_way_bars_the_detour() -> None:
+    """A plate from -1.5 to 1 m, made longer by a second one up to 1.3 m, is a plate to 1.3 m."""
+    ends = [-0.4, 0.0], [0.4, 0.0]
+    longer = _shortest(*ends, [[0, -0.25, 0, 1e-9, 1.25], [0, 1.15, 0, 1e-9, 0.15]], side=4.0)
+    whole = _shortest(*ends, [[0, -0.1, 0, 1e-9, 1.4]], side=4.0)
+    assert longer == pytest.approx(whole, abs=1e-9)
+
+
 def test_robots_of_an_arena_do_not_change_each_others_ways() -> None:
     """The results for one robot's path are kept for the next robot."""
     random = np.random.default_rng(5)
