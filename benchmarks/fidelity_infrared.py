@@ -179,7 +179,7 @@ def other_robot(length: float, reflectance: float) -> float:
     )
     shade = Reflectance(robot=np.array([1.0, reflectance]))
     side, reach = np.array(rig.SIDE), response.REACH["webots"]
-    ray, bright = infrared.sights(pose, side, _NO_BOX, HULL, reach, shade, infrared.EPUCK, np)
+    ray, bright = infrared.sights(pose, side, _NO_BOX, HULL, reach, shade, infrared.EPUCK)
     return float(response.read("webots", ray, bright, Wear(), None, np)[0, 0])
 
 

@@ -5,7 +5,7 @@ The rest of this package uses plain MJX and plain loops.
 
 import importlib
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,6 +40,8 @@ _MOST_RUBBING_SWEEPS = 400
 # (design note 38).
 MOST_WHEELED = 5
 MOST_PIECES = 16  # objects processed one by one; the program grows with their number
+MOST_COMPARED = 64  # robots of which all pairs are compared
+_UNROLLED = 8  # objects of one round of a loop; 4 and 16 were no faster
 
 
 def resolve_impl(impl: str) -> str:
@@ -188,6 +190,16 @@ def load_paths(impl: str) -> ModuleType | None:
     return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.paths_warp")
 
 
+def has_cells(robots: int, listed: int) -> bool:
+    """Returns whether robots look for others in cells; else all pairs are compared.
+
+    Args:
+      robots: number of robots.
+      listed: how many robots the cells list for each robot.
+    """
+    return robots > max(MOST_COMPARED, listed)
+
+
 def pieces(count: int, xp: Any) -> list[slice]:
     """Splits an axis of objects into slices, so that XLA makes one kernel of the computation.
 
@@ -222,3 +234,26 @@ def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
     for value in values:
         found = xp.minimum(found, xp.min(value, axis=-1, initial=limit))
     return found
+
+
+def in_turn[T](step: Callable[[T, Any], T], first: T, things: Any) -> T:
+    """Folds a step over many objects, one by one, in JAX.
+
+    On a CPU, XLA computes a minimum over the last axis without vector instructions. Object by
+    object, all operations are elementwise. For the rays of 1,024 robots and 256 boxes, this was
+    ten times as fast.
+
+    Args:
+      step: takes the result so far and one object; returns the new result.
+      first: result for no objects.
+      things: arrays [N, ...] of the objects.
+
+    Returns:
+      The result for all objects.
+    """
+    import jax
+
+    folded = jax.lax.scan(
+        lambda found, one: (step(found, one), None), first, things, unroll=_UNROLLED
+    )
+    return folded[0]

@@ -2,17 +2,23 @@
 
 from typing import Any
 
-import numpy as np
-
 from swarmjax.sim.dispatch import least, pieces
 from swarmjax.sim.infrared import Box, to_box_frame, turned
+from swarmjax.sim.neighbours import Near, others
 
 Array = Any
 KINDS = ("robot", "obstacle", "wall")  # the last axis of gaps and contacts
 CONTACT_PAUSE = 0.1  # s; a contact interrupted for less than this is still the same contact
 
 
-def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any) -> Array:
+def gaps(
+    pose: Array,
+    side: Array,
+    obstacle: Array,
+    hull_radius: float,
+    xp: Any,
+    near: Near | None = None,
+) -> Array:
     """Computes the gap from each hull to the nearest object of each kind; overlap is negative.
 
     Args:
@@ -21,27 +27,29 @@ def gaps(pose: Array, side: Array, obstacle: Array, hull_radius: float, xp: Any)
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
       xp: `numpy` or `jax.numpy`.
+      near: the robots near each robot; None compares all pairs.
 
     Returns:
-      [R, 3] m, in the order of `KINDS`; `inf` without an object of that kind.
+      [R, 3] m, in the order of `KINDS`; `inf` without an object of that kind. With `near`, gaps
+      between robots are exact up to the limit that these were found with. A larger gap is given as
+      any number above that limit, or `inf`; contacts need only gaps of at most 0.
     """
     x, y = pose[:, :1], pose[:, 1:2]
-    others = (_robot_distance(x, y, i, xp) for i in pieces(len(pose), xp))
+    other_x, other_y, myself = others(pose, near, xp)
+
+    def to_robots(i: slice) -> Array:
+        across, along = x - other_x[:, i], y - other_y[:, i]
+        return xp.where(myself[:, i], xp.inf, xp.sqrt(across * across + along * along))
+
+    robots = (to_robots(i) for i in pieces(myself.shape[-1], xp))
     box = turned(obstacle, xp)
     boxes = (_box_distance(x, y, box.at((None, i)), xp) for i in pieces(len(obstacle), xp))
     found = (
-        least(others, xp.inf, xp) - 2.0 * hull_radius,
+        least(robots, xp.inf, xp) - 2.0 * hull_radius,
         least(boxes, xp.inf, xp) - hull_radius,
         0.5 * side - xp.maximum(xp.abs(x), xp.abs(y))[:, 0] - hull_radius,
     )
     return xp.stack(found, axis=-1)
-
-
-def _robot_distance(x: Array, y: Array, piece: slice, xp: Any) -> Array:
-    """Returns distances [R, N] (m) from robots, [R, 1] each, to a slice of the other robots."""
-    across, along = x - x[piece, 0], y - y[piece, 0]
-    itself = np.eye(len(x), dtype=bool)[:, piece]
-    return xp.where(itself, xp.inf, xp.sqrt(across * across + along * along))
 
 
 def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:

@@ -13,9 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarmjax import epuck
-from swarmjax.sim.dispatch import least, pieces
+from swarmjax.sim.dispatch import in_turn, least, pieces
+from swarmjax.sim.neighbours import Near, others
 
 Array = Any
+# Objects of one kind: distances (m) along rays, as pieces [..., R, K, N], and their reflectances
+# [..., R or 1, K or 1, N]; None for 1.
+_Thing = tuple[list[Array], Array | None]
 
 
 class Mount(NamedTuple):
@@ -209,11 +213,13 @@ def distances(
     limit: float,
     xp: Any,
     mount: Mount = EPUCK,
+    near: Near | None = None,
 ) -> Array:
     """Returns the exact distances that the infrared sensors of a swarm see.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
+        [R, 3] with `near`.
       side: [...] side of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones are parked far
         away.
@@ -221,11 +227,14 @@ def distances(
       limit: range of a sensor from its own origin, m.
       xp: `numpy` or `jax.numpy`.
       mount: how the sensors are mounted.
+      near: the robots near each robot, found with this `limit`; None compares all pairs.
 
     Returns:
       [..., R, K] distance from the sensor's origin to the nearest surface, m, 0..limit.
     """
-    reaches = itertools.chain(*_reaches(pose, side, obstacle, hull_radius, mount, xp))
+    dull = Reflectance()
+    things = _things(pose, side, obstacle, hull_radius, mount, dull, near, xp)
+    reaches = itertools.chain(*(reaches for reaches, _ in things))
     return xp.maximum(least(reaches, limit, xp), 0.0)
 
 
@@ -237,19 +246,20 @@ def sights(
     limit: float,
     reflectance: Reflectance,
     mount: Mount,
-    xp: Any,
+    near: Near | None = None,
 ) -> tuple[Array, Array]:
     """Returns what the infrared sensors of a swarm see: distances and reflectances.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
+        [R, 3] with `near`. The array module is the one of `pose`.
       side: [...] side of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
       limit: range of a sensor from its own origin, m.
       reflectance: reflectances of surfaces.
       mount: how the sensors are mounted.
-      xp: `numpy` or `jax.numpy`.
+      near: the robots near each robot, found with this `limit`; None compares all pairs.
 
     Returns:
       Distance [..., R, K] from the sensor's origin to the nearest surface, m, 0..limit; and the
@@ -257,12 +267,9 @@ def sights(
       takes precedence over a robot, and a robot over an obstacle. Among objects of one kind, the
       brightest takes precedence.
     """
-    wall, robot, box = _reaches(pose, side, obstacle, hull_radius, mount, xp)
-    shades = reflectance.fixture
-    walls, boxes = (None, None) if shades is None else (shades[..., :1], shades[..., 1:])
-    things = ((wall, walls), (robot, reflectance.robot), (box, boxes))
+    xp = pose.__array_namespace__()
     nearest, bright = xp.inf, 1.0
-    for reaches, shade in things:
+    for reaches, shade in _things(pose, side, obstacle, hull_radius, mount, reflectance, near, xp):
         here = least(reaches, xp.inf, xp)
         bright = xp.where(here < nearest, _brightest(reaches, here, shade, xp), bright)
         nearest = xp.minimum(nearest, here)
@@ -276,24 +283,58 @@ def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) 
     found = 0.0
     for reach, piece in zip(reaches, pieces(shade.shape[-1], xp), strict=True):
         meets = reach <= here[..., None]
-        shades = xp.where(meets, shade[..., None, None, piece], 0.0)
+        shades = xp.where(meets, shade[..., piece], 0.0)
         found = xp.maximum(found, xp.max(shades, axis=-1, initial=0.0))
     return found
 
 
-def _reaches(
-    pose: Array, side: Array, obstacle: Array, hull_radius: float, mount: Mount, xp: Any
-) -> tuple[list[Array], list[Array], list[Array]]:
-    """Returns distances (m) to walls, other robots and obstacles, as pieces [..., R, K, N]."""
+def _things(
+    pose: Array,
+    side: Array,
+    obstacle: Array,
+    hull_radius: float,
+    mount: Mount,
+    reflectance: Reflectance,
+    near: Near | None,
+    xp: Any,
+) -> tuple[_Thing, _Thing, _Thing]:
+    """Returns walls, other robots and obstacles, as the rays of a swarm meet them."""
     ray = _cast(pose, xp, mount)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
-    ray = Ray(*(part[..., None] for part in ray))
-    box, myself = turned(obstacle, xp), np.eye(pose.shape[-2], dtype=bool)
+    x, y, myself = others(pose, near, xp)
+    long = Ray(*(part[..., None] for part in ray))
 
     def to_robots(i: slice) -> Array:
-        x, y = (pose[..., None, None, i, axis] for axis in range(2))
-        return xp.where(myself[:, None, i], xp.inf, ray_disc(ray, x, y, hull_radius, xp))
+        reach = ray_disc(long, x[..., None, i], y[..., None, i], hull_radius, xp)
+        return xp.where(myself[:, None, i], xp.inf, reach)
 
-    robots = [to_robots(i) for i in pieces(pose.shape[-2], xp)]
-    boxes = [ray_box(ray, box.at((..., None, None, i)), xp) for i in pieces(obstacle.shape[-2], xp)]
-    return [wall], robots, boxes
+    robots = [to_robots(i) for i in pieces(myself.shape[-1], xp)]
+    fixture, shade = reflectance
+    shade = _pick(shade, np.s_[..., None, None, :] if near is None else np.s_[near.index[:, None]])
+    walls = [wall], _pick(fixture, np.s_[..., None, None, :1])
+    box = turned(obstacle, xp)
+    if near is not None and xp is not np:
+        found = _boxes_in_turn(ray, box, _pick(fixture, np.s_[1:]), xp)
+        return walls, (robots, shade), found
+    boxes = [ray_box(long, box.at((..., None, None, i)), xp) for i in pieces(box.x.shape[-1], xp)]
+    return walls, (robots, shade), (boxes, _pick(fixture, np.s_[..., None, None, 1:]))
+
+
+def _pick(shade: Array | None, index: Any) -> Array | None:
+    return None if shade is None else shade[index]
+
+
+def _boxes_in_turn(ray: Ray, box: Box, shades: Array | None, xp: Any) -> _Thing:
+    """Returns the nearest of many obstacles [M] that rays [R, K] meet, as one obstacle per ray."""
+
+    def meet(found: tuple[Array, Array], one: tuple[Box, Array]) -> tuple[Array, Array]:
+        (here, bright), (each, shade) = found, one
+        reach = ray_box(ray, each, xp)
+        if shades is not None:
+            brighter = xp.where(reach == here, xp.maximum(bright, shade), bright)
+            bright = xp.where(reach < here, shade, brighter)
+        return xp.minimum(here, reach), bright
+
+    nothing = xp.full(ray.x.shape, xp.inf)
+    here, bright = in_turn(meet, (nothing, xp.zeros_like(nothing)), (box, shades))
+    return [here[..., None]], None if shades is None else bright[..., None]

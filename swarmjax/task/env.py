@@ -13,9 +13,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.sim import dispatch, infrared, physics
+from swarmjax.sim import dispatch, infrared, neighbours, physics
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
+from swarmjax.sim.neighbours import Near
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import (
     extended,
@@ -79,7 +80,8 @@ class TimeStep(NamedTuple):
       valid: [R] whether to learn from the transition: the robot drove (with `latch`, it had not
         arrived before) and the physics is sound.
       done: [] whether the arena's episode is over.
-      sound: [] whether physics, rewards, distances and observations are all finite.
+      sound: [] whether physics, rewards, distances and observations are all finite, and no robot
+        has more neighbours than `neighbours.room` allows for.
       measured: [K] the goal's own measures so far.
     """
 
@@ -109,7 +111,8 @@ def reset(world: World, level: Level) -> EnvState:
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     goal, target = world.goal.begin(level)
     level = level._replace(target=target)
-    sight = _look(world, level.start, level, factors)
+    near = _neighbours(world, level.start)
+    sight = _look(world, level.start, level, factors, near)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     return EnvState(
@@ -172,15 +175,15 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     level = state.level
     active = level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
-    data, memory, pose, sound = _move(world, state, action, active)
-    looked = _look(world, pose, level, state.factors)  # at the targets of before
+    data, memory, pose, near, sound = _move(world, state, action, active)
+    looked = _look(world, pose, level, state.factors, near)  # at the targets of before
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
-    begins, apart = _count_contacts(world, state, pose)
+    begins, apart = _count_contacts(world, state, pose, near)
     after = replace(
         state,
         sim=data,
@@ -232,10 +235,20 @@ def _turn(
     return turn, state.level._replace(target=turn.target), sight
 
 
-def _count_contacts(world: World, state: EnvState, pose: Array) -> tuple[Array, Array]:
+def _neighbours(world: World, pose: Array) -> Near | None:
+    """Lists the robots that each robot may see or touch; None compares all pairs."""
+    hull, reach = world.robot.hull_radius, world.electronics.reach
+    if not dispatch.has_cells(len(pose), neighbours.ROWS * neighbours.room(hull, reach)):
+        return None
+    return neighbours.find(pose, hull, reach, jnp)
+
+
+def _count_contacts(
+    world: World, state: EnvState, pose: Array, near: Near | None
+) -> tuple[Array, Array]:
     """Returns which contacts [R, 3] begin at poses [R, 3], and the time since the last contacts."""
     level = state.level
-    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp)
+    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp, near)
     begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
     return begins & level.present[:, None], apart
 
@@ -281,11 +294,11 @@ def _is_finite(numbers: Array, counted: Array) -> Array:
 
 def _move(
     world: World, state: EnvState, action: Array, active: Array
-) -> tuple[Any, Memory, Array, Array]:
+) -> tuple[Any, Memory, Array, Near | None, Array]:
     """Steps the physics; only active robots obey their commands.
 
     Returns:
-      Data, memory, poses, and whether the physics is sound.
+      Data, memory, poses, the robots near each robot, and whether the physics is sound.
     """
     found, level = state.factors, state.level
     command = sim_drive.command(action, world.drive, jnp)
@@ -298,10 +311,12 @@ def _move(
     sound = physics.is_finite(data)
     # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
-    return data, memory, jnp.where(sound, after, before), sound
+    pose = jnp.where(sound, after, before)
+    near = _neighbours(world, pose)
+    return data, memory, pose, near, sound if near is None else sound & ~near.full
 
 
-def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
+def _look(world: World, pose: Array, level: Level, factors: Factors, near: Near | None) -> Sight:
     """Computes the sensor quantities at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     radius, reach = world.robot.hull_radius, world.electronics.reach
@@ -309,9 +324,9 @@ def _look(world: World, pose: Array, level: Level, factors: Factors) -> Sight:
     shades = task_electronics.reflectance(factors)
     arena = (pose, level.side, level.obstacle, radius, reach)
     if shades is None:
-        ray, bright = infrared.distances(*arena, jnp, mount), None
+        ray, bright = infrared.distances(*arena, jnp, mount, near), None
     else:
-        ray, bright = infrared.sights(*arena, shades, mount, jnp)
+        ray, bright = infrared.sights(*arena, shades, mount, near)
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))

@@ -58,7 +58,7 @@ class Ended(NamedTuple):
       sensed: control steps in which a ray was shorter than the infrared range.
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
-      broken: 1 where the episode ended because the physics was no longer finite.
+      broken: 1 where the episode ended because the arena was no longer `sound`.
       measured: [.., K] the goal's own measures; None if it has none.
       robots: results per robot, if `run.episodes` asks for them.
     """

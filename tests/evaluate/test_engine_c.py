@@ -528,7 +528,7 @@ def test_the_judge_sees_how_bright_each_thing_is(tmp_path: Path) -> None:
     sight, shades = engine_c.look(judge, *args), electronics.reflectance(arenas.factors)
     assert shades is not None
     assert sight.reflectance is not None
-    ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, infrared.EPUCK, np)
+    ray, bright = infrared.sights(pose, side, box, 0.037, 0.1, shades, infrared.EPUCK)
     # If several things overlap a ray's origin, MuJoCo does not tell which one the ray hits. Such
     # rays are left out.
     apart = (ray > 0.0) & (sight.ray > 0.0) & (ray < 0.1)

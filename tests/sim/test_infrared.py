@@ -210,7 +210,7 @@ def test_sights_tell_how_bright_the_nearest_thing_is(xp: ModuleType) -> None:
     pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0], [0.2, 0.3, 0.0]))
     box = xp.array(_f32([-0.45, -0.06, 0.0, 0.01, 0.01], [0.2, 0.0, 0.0, 0.02, 0.02]))
     distance, bright = infrared.sights(
-        pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount(), xp
+        pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount()
     )
     expected = np.ones((3, 8))  # 1 where a sensor sees nothing
     expected[0, 5] = 0.4
@@ -231,7 +231,7 @@ def test_what_has_no_reflectance_of_its_own_is_as_bright_as_can_be(xp: ModuleTyp
     pose = xp.array(_f32([-0.45, 0.0, 0.0], [-0.45, 0.09, 0.0]))
     only_robots = _reflectance(xp, robot=(0.38, 0.38))
     _, bright = infrared.sights(
-        pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, only_robots, Mount(), xp
+        pose, _f32(1.0)[0], _no_box(xp), RADIUS, RANGE, only_robots, Mount()
     )
     expected = np.ones((2, 8))
     expected[0, 5] = expected[1, 2] = 0.38
@@ -248,7 +248,7 @@ def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
     for x, shade in ((0.45, 0.7), (0.472, 0.9)):
         pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
         distance, bright = infrared.sights(
-            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount(), xp
+            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount()
         )
         np.testing.assert_array_equal(np.asarray(distance)[0, [0, 7]], 0.0)
         np.testing.assert_allclose(np.asarray(bright)[0, [0, 7]], shade, atol=ROUNDING)
@@ -469,7 +469,7 @@ def test_sights_are_those_of_mujoco_at_10000_random_poses(xp: ModuleType) -> Non
     )
     side = xp.full(MANY, ARENA, kind)
     pose, box = xp.array(pose, kind), xp.array(box, kind)
-    distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, Mount(), xp)
+    distance, bright = infrared.sights(pose, side, box, RADIUS, RANGE, reflectance, Mount())
     # Float32 rounds positions of up to 0.5 m to 3e-8 m. A slanted face or a chord of a hull
     # multiplies this error several times, here to 3.0e-7 m at most. In float64 an error of 1.3e-8 m
     # remains: the sensors' poses are float32 constants, so directions are longer or shorter than 1

@@ -45,7 +45,7 @@ def _before_a_wall(gap: float, xp: ModuleType) -> np.ndarray:
     pose = xp.array([[0.5 - RADIUS - gap, 0.1, 0.0]], kind)
     side, box = xp.array(1.0, kind), xp.array(NO_BOX, kind)
     ray, bright = infrared.sights(
-        pose, side, box, RADIUS, REACH["webots"], Reflectance(), infrared.EPUCK, xp
+        pose, side, box, RADIUS, REACH["webots"], Reflectance(), infrared.EPUCK
     )
     return np.asarray(response.read("webots", ray, bright, Wear(), None, xp))[0]
 
@@ -328,7 +328,7 @@ def test_another_epuck_seen_side_by_side(xp: ModuleType, length: float, counts: 
     pose = xp.array([[0.0, 0.0, 0.0], [0.0, apart, 0.0]], kind)
     ray, bright = infrared.sights(
         pose, side, xp.array(NO_BOX), RADIUS, REACH["webots"],
-        Reflectance(robot=xp.array([0.38, 0.38], kind)), infrared.EPUCK, xp,
+        Reflectance(robot=xp.array([0.38, 0.38], kind)), infrared.EPUCK,
     )  # fmt: skip
     found = np.asarray(response.read("webots", ray, bright, Wear(), None, xp))
     expected = np.full((2, 8), 67.19)

@@ -12,7 +12,7 @@ import pytest
 from entries import BEARING, DISTANCE, INFRARED, KNOWN
 
 from swarmjax.run.load_settings import load_train
-from swarmjax.sim import gaps, infrared, physics
+from swarmjax.sim import dispatch, gaps, infrared, neighbours, physics
 from swarmjax.task import env, observation
 from swarmjax.task import factors as task_factors
 from swarmjax.task import stage as task_stage
@@ -448,6 +448,40 @@ def test_an_arena_breaks_by_what_is_seen_and_earned_as_well(
         (broken, came),
         (_slim(sound), expected),
     )
+
+
+def _step_in_cells(monkeypatch: pytest.MonkeyPatch, world: World) -> ArenaStep:
+    """Returns the control step of a swarm that is large enough to look for others in cells."""
+    monkeypatch.setattr(dispatch, "has_cells", lambda robots, listed: True)
+    return jax.jit(jax.vmap(functools.partial(env.step, world)))
+
+
+def test_a_large_swarm_senses_and_touches_what_a_small_one_does(
+    monkeypatch: pytest.MonkeyPatch,
+    tiny_world: World,
+    start: EnvState,
+    actions: np.ndarray,
+    episode: Episode,
+) -> None:
+    step, state = _step_in_cells(monkeypatch, tiny_world), start
+    for i, action in enumerate(actions):
+        state, came = step(state, jnp.asarray(action))
+        np.testing.assert_allclose(came.observation, episode.came.observation[i], atol=1e-6)
+        np.testing.assert_array_equal(came.valid, episode.came.valid[i])
+    np.testing.assert_array_equal(state.episode.contacts, episode.state.episode.contacts[-1])
+    assert np.any(state.episode.contacts)
+
+
+def test_an_arena_with_more_robots_in_a_place_than_fit_is_broken(
+    monkeypatch: pytest.MonkeyPatch, tiny_world: World, start: EnvState, actions: np.ndarray
+) -> None:
+    monkeypatch.setattr(neighbours, "room", lambda hull_radius, limit: 1)
+    came = _step_in_cells(monkeypatch, tiny_world)(start, jnp.asarray(actions[0]))[1]
+    crowds = np.array(RANDOM)
+    assert not came.sound[crowds].any()
+    assert came.done[crowds].all()
+    assert not came.valid[crowds].any()
+    assert came.sound[np.array([STANDING, BUMPING])].all()  # no two robots are near
 
 
 def test_what_an_absent_robot_sees_breaks_nothing(
