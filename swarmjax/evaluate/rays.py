@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from swarmjax.sim import infrared
+from swarmjax.sim import dispatch, infrared, neighbours
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
@@ -120,14 +120,27 @@ def _near(
     Returns:
       [A, R, K].
     """
-    myself = np.eye(place.shape[-2], dtype=bool)[:, None]
-    robots = _apart(middle, place) - scene.robot.hull_radius
+    robots = _apart_from_robots(scene, middle, place) - scene.robot.hull_radius
     boxes = _apart(middle, obstacle[..., :2])
     boxes -= np.linalg.norm(obstacle[:, None, None, :, 3:], axis=-1)
     wall = 0.5 * scene.side - np.abs(middle).max(axis=-1)
-    things = [np.where(myself, np.inf, robots), boxes, wall[..., None]]
+    things = [robots, boxes, wall[..., None]]
     radius = 0.5 * scene.reach
     return np.concatenate(things, axis=-1).min(axis=-1) <= radius
+
+
+def _apart_from_robots(scene: RayScene, middle: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Computes distances [A, R, K, N], m, from middles of rays to other robots that may be near."""
+    robots, hull = place.shape[-2], scene.robot.hull_radius
+    if dispatch.has_cells(robots, neighbours.ROWS * neighbours.room(hull, scene.reach)):
+        near = [neighbours.find(each, hull, scene.reach, np) for each in place]
+        if not any(each.full for each in near):
+            listed = [each[found.index] for each, found in zip(place, near, strict=True)]
+            index = np.stack([each.index for each in near])
+            myself = index == np.arange(robots)[:, None]
+            apart = np.linalg.norm(middle[..., None, :] - np.stack(listed)[:, :, None], axis=-1)
+            return np.where(myself[:, :, None], np.inf, apart)
+    return np.where(np.eye(robots, dtype=bool)[:, None], np.inf, _apart(middle, place))
 
 
 def _apart(ray: np.ndarray, thing: np.ndarray) -> np.ndarray:
