@@ -81,7 +81,7 @@ def test_robots_on_the_borders_of_cells_are_listed(places: list[tuple[float, flo
     pose[:, :2] = places
     near = find(pose, xp=np)
     apart = np.hypot(*(pose[:, None, :2] - pose[:, :2]).T) + 9.0 * np.eye(len(pose))
-    if apart.min() >= 0.9 * 2.0 * RADIUS:
+    if apart.min() >= 0.85 * 2.0 * RADIUS:
         assert not near.full
     assert near.full or _listed(near)[_pairs(pose)].all()
 
@@ -113,13 +113,13 @@ def test_parked_robots_fill_no_cell() -> None:
 
 
 def test_hulls_of_a_jam_fit_with_room_to_spare() -> None:
-    """Counts the densest packing with 10 % of overlap in the cells of a row."""
+    """Counts the densest packing with 15 % of overlap in the cells of a row."""
     height = neighbours._SLACK * REACH
-    pitch = 0.9 * 2.0 * RADIUS
+    pitch = 0.85 * 2.0 * RADIUS
     columns = np.floor(2.0625 * height / pitch) + 1
     rows = np.floor(height / (np.sqrt(0.75) * pitch)) + 1
     assert columns * rows <= ROOM
-    assert ROOM == 13  # 7.1 by area, 5.3 by perimeter, and 1
+    assert ROOM == 14  # 8.0 by area, 5.6 by perimeter, and 1
 
 
 def _check(scene: tuple[Any, Any, Any], xp: ModuleType) -> None:
@@ -184,7 +184,7 @@ def test_rays_and_gaps_are_those_of_all_pairs_in_10000_arenas(jammed: bool) -> N
     assert (np.asarray(gap)[~seen] > RANGE - ROUNDING).all()
 
 
-@pytest.mark.parametrize(("robots", "listed"), [(64, 39), (90, 90)])
+@pytest.mark.parametrize(("robots", "listed"), [(64, 42), (90, 90)])
 def test_few_robots_compare_all_pairs(robots: int, listed: int) -> None:
     assert not dispatch.has_cells(robots, listed)
     assert dispatch.has_cells(robots + 1, listed)
