@@ -40,7 +40,7 @@ _MOST_RUBBING_SWEEPS = 400
 # (design note 38).
 MOST_WHEELED = 5
 MOST_PIECES = 16  # objects processed one by one; the program grows with their number
-MOST_COMPARED = 64  # robots of which all pairs are compared
+MOST_COMPARED = 100  # robots of which all pairs are compared
 _UNROLLED = 8  # objects of one round of a loop; 4 and 16 were no faster
 
 

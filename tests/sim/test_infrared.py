@@ -346,14 +346,16 @@ def test_distances_are_those_of_mujoco_at_1000_random_poses(xp: ModuleType, pose
     np.testing.assert_allclose(found, seen_by_mujoco, rtol=0, atol=5e-7)
 
 
-def test_mujoco_sees_the_nearest_of_a_hundred_robots() -> None:
+def test_mujoco_sees_the_nearest_of_many_robots() -> None:
     """The judge lists robots near a ray by cells; the other side compares all pairs."""
-    judge = _judge(StageConfig(name="test", robots=100, side=3.0), epuck.SENSOR_POSES)
+    judge = _judge(
+        StageConfig(name="test", level="plots", robots=121, side=3.0), epuck.SENSOR_POSES
+    )
     draw = np.random.default_rng(1)
     # Robots lie 85 mm apart, give or take 10 mm: gaps of up to 21 mm.
-    middle = (np.stack(np.divmod(np.arange(100), 10), axis=-1) - 4.5) * 0.085
-    place = middle + draw.uniform(-0.005, 0.005, (100, 2))
-    pose = np.concatenate([place, draw.uniform(-3, 3, (100, 1))], axis=-1).astype(np.float32)[None]
+    middle = (np.stack(np.divmod(np.arange(121), 11), axis=-1) - 5.0) * 0.085
+    place = middle + draw.uniform(-0.005, 0.005, (121, 2))
+    pose = np.concatenate([place, draw.uniform(-3, 3, (121, 1))], axis=-1).astype(np.float32)[None]
     box = np.zeros((1, 0, 5), np.float32)
     data = np.empty(1, object)
     data[0] = engine_c.place(judge, judge.model, pose[0], box[0])
