@@ -14,7 +14,7 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import dispatch, drive, model, physics
 from swarmjax.sim.body import AS_BUILT
 from swarmjax.sim.config import RobotConfig, SimConfig, physics_substeps
-from swarmjax.sim.fast import discs, planar_jax
+from swarmjax.sim.fast import contacts_warp, discs, planar_jax
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.training import program as programs
 
@@ -241,7 +241,8 @@ def _beside_the_box(pose: np.ndarray) -> np.ndarray:
     return moved
 
 
-def test_a_hundred_robots_push_each_other_apart_as_in_c() -> None:
+def test_a_hundred_robots_push_each_other_apart_as_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contacts_warp, "MANY", 99)  # to find their contacts by cells
     stage = StageConfig(name="many", robots=100, side=4.0, obstacles=1, obstacle_size=0.1)
     (pose, wheels), side = _crowds(0.7, 2, stage.robots), 0.7
     found = _on_device(_load("warp", "planar", "swarm", stage=stage), side, pose, wheels)

@@ -4,8 +4,8 @@ A kernel has one thread per arena. A thread lists the contacts of its arena, and
 forces (`planar_warp`, and `rubbing_warp` with friction). In a kernel that XLA unrolls over all
 possible contacts, most of the work would go to contacts that do not exist.
 
-A thread that compares all pairs of many robots would take too long. For `MANY` robots or more, one
-thread per obstacle, wall and robot lists the contacts with robots in the cells around it
+A thread that compares all pairs of many robots would take too long. For more than `MANY` robots,
+one thread per obstacle, wall and robot lists the contacts with robots in the cells around it
 (`cells_warp`), in the same order. The thread of the arena then only solves for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
@@ -29,7 +29,7 @@ from swarmjax.sim.fast import discs as sim_discs
 from swarmjax.sim.fast.arenas_warp import over_arenas
 from swarmjax.sim.fast.discs import DiscRobots, Discs
 
-MANY = 100  # robots; on two cores, cells take less time from about here on
+MANY = 100  # robots; on two cores, cells take less time beyond about this number
 _BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
 # Edge of a cell in radii: 5 % more than a hull's diameter, for rounding.
 CELL = wp.constant(2.1)
@@ -75,7 +75,7 @@ def _launch(
     make = functools.partial(wp.jax_kernel, num_outputs=2, block_dim=_BLOCK)
     shapes = {"contact": (rows, contacts, arenas), "total": (arenas, count)}
     given, (few, many) = (side, obstacle, jnp.asarray(numbers)), kernels
-    if count < MANY:
+    if count <= MANY:
         moving = robots.place, robots.rate, dynamics
         return make(few)(*moving, *given, launch_dims=arenas, output_dims=shapes)[1]
     listed, contact = list_by_cells(shapes["contact"], discs.radius, robots.place, *given)
