@@ -33,7 +33,7 @@ TAKEN = {
     "observation": ("infrared", "target_distance", "target_bearing"),
     "level": (
         *("random", "fixed", "map"),
-        *("trap", "fence", "bay", "row", "door", "maze", "blocks", "circle", "crowd"),
+        *("trap", "fence", "bay", "row", "door", "maze", "blocks", "circle", "crowd", "plots"),
     ),
     "network": ("mlp",),
     "curriculum": ("sequential", "mixed", "adaptive", "frontier"),

@@ -137,13 +137,13 @@ def test_levels_are_those_of_the_other_judge(
 
 
 def test_what_a_level_lacks_is_parked_as_in_training(stage: StageConfig, levels: Level) -> None:
-    # Absent things stand 5 m out and 0.5 m apart: robot i at (5 + i / 2, 5), and obstacle j at
-    # (-5 - j / 2, -5).
+    # Absent things stand 30 m out and 0.5 m apart: robot i at (30 + i / 2, 30), and obstacle j at
+    # (-30 - j / 2, -30).
     for i in range(stage.robots, 3):
-        np.testing.assert_array_equal(levels.start[:, i], [[5 + 0.5 * i, 5, 0]] * EPISODES)
-        np.testing.assert_array_equal(levels.target[:, i], [[5 + 0.5 * i, 5]] * EPISODES)
+        np.testing.assert_array_equal(levels.start[:, i], [[30 + 0.5 * i, 30, 0]] * EPISODES)
+        np.testing.assert_array_equal(levels.target[:, i], [[30 + 0.5 * i, 30]] * EPISODES)
     for j in range(stage.obstacles, 2):
-        place = [[-5 - 0.5 * j, -5, 0]] * EPISODES
+        place = [[-30 - 0.5 * j, -30, 0]] * EPISODES
         np.testing.assert_array_equal(levels.obstacle[:, j, :3], place)
         assert (levels.obstacle[:, j, 3:] > 0.0).all()
     assert levels.present.sum() == EPISODES * stage.robots

@@ -153,9 +153,9 @@ def test_a_threshold_is_a_number_or_a_list_of_numbers():
 def test_stages_of_a_curriculum_are_named_in_sentences():
     good, bad = STAGE, STAGE | {"name": "t", "robots": 0}
     assert refusal(build, TrainConfig, {"stage": [good, bad]}) == (
-        "stage t: robots is 0: give 1 to 100."
+        "stage t: robots is 0: give 1 to 1024."
     )
-    assert refusal(build, TrainConfig, {"stage": [bad]}) == "stage.robots is 0: give 1 to 100."
+    assert refusal(build, TrainConfig, {"stage": [bad]}) == "stage.robots is 0: give 1 to 1024."
     assert refusal(build, TrainConfig, {"stage": [good, 3]}) == (
         "stage 1 is 3: give its keys, such as stage 1: name."
     )
@@ -169,7 +169,7 @@ def test_a_missing_key_is_named():
 
 
 def test_sections_made_by_hand_are_held_to_their_bounds():
-    assert refusal(lambda: SimConfig(max_robots=0)) == "max_robots is 0: give 1 to 100."
+    assert refusal(lambda: SimConfig(max_robots=0)) == "max_robots is 0: give 1 to 1024."
     assert refusal(lambda: RewardConfig(step_penalty=math.nan)) == (
         "step_penalty is nan: give -1000000 to 1000000."
     )

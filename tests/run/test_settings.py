@@ -51,7 +51,7 @@ def test_every_stage_file_can_be_trained():
     files = {path.stem for path in (ROOT / "configs" / "stage").glob("*.yaml")}
     assert files >= {"curriculum", "worlds", "expanded"}
     for name in files:
-        train = load_train([f"stage={name}", "sim.max_robots=100", "sim.max_obstacles=32"])
+        train = load_train([f"stage={name}", "sim.max_robots=200", "sim.max_obstacles=50"])
         assert train.stage_name == name
 
 
@@ -211,8 +211,10 @@ def test_import_needs_neither_jax_nor_hydra():
          "mixed, adaptive, frontier, or extensions=FILE, a file that defines it."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
          "than 0, at most 1."),
-        (["stage=s6", "stage.side=5"], "stage.side is 5: give 0.4 to 4."),
-        (["stage=s6", "stage.side=[0.8,5]"], "stage.side is [0.8,5]: give 0.4 to 4."),
+        (["stage=s6", "stage.side=5"], "stage.side is 5, but level is random: give at "
+         "most 4, or level=plots."),
+        (["stage=s6", "stage.side=[0.8,5]"], "stage.side is [0.8,5], but level is random: "
+         "give at most 4, or level=plots."),
         (["stage=s6", "stage.side=[1.2,1]"], "stage.side is [1.2,1]: give the lower number first."),
         (["stage=s6", "stage.side=[1,1.2,2]"], "stage.side is [1,1.2,2]: give a number or a range "
          "[low,high] of numbers."),
@@ -410,7 +412,7 @@ def test_help_lists_every_key_once():
 def test_help_gives_default_meaning_and_allowed_values():
     text = help_text(TrainConfig, "swarmjax.train", ["all"])
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "stage.robots=<the stage> active robots (a whole number 1 to 100)" in lines
+    assert "stage.robots=<the stage> active robots (a whole number 1 to 1024)" in lines
     assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
         "run.chunk=auto updates per call of the compiled program; auto: a second of them "

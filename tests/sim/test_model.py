@@ -182,11 +182,11 @@ def test_fixtures_stand_where_the_level_says(compiled: mujoco.MjModel) -> None:
     for i, outward in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
         box, half = data.geom(f"wall{i}_box"), compiled.geom(f"wall{i}_box").size
         extent = np.abs(box.xmat.reshape(3, 3)[:2]) @ half
-        # The inner face is half a side from the centre. 1e-6 m is the rounding of a float32 bearing
-        # at 2.5 m.
-        assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=1e-6)
-        # The wall is at least as long as the largest arena's side, 4 m.
-        assert (extent * (1 - np.abs(outward))).sum() >= 2.0
+        # The inner face is half a side from the centre. 8e-6 m is the rounding of a float32 bearing
+        # at 20.5 m.
+        assert np.dot(box.xpos[:2] - extent * outward, outward) == pytest.approx(0.45, abs=8e-6)
+        # The wall is at least as long as the largest arena's side, 40 m.
+        assert (extent * (1 - np.abs(outward))).sum() >= 20.0
 
 
 def test_resized_obstacles_are_those_that_would_be_compiled(compiled: mujoco.MjModel) -> None:
