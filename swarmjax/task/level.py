@@ -279,8 +279,8 @@ def _laid_out(
     if xp is not np:
         from jax import lax  # evaluations draw levels without JAX
 
-        # Without the barrier, XLA hashes anew wherever a number is used; the layout of 20 robots on
-        # plots took 18 s to compile, and takes 1 s.
+        # Without the barrier, XLA repeats the hash at each use of a number. The layout of 20 robots
+        # on plots then takes 18 s to compile instead of 1 s.
         uniforms = lax.optimization_barrier(uniforms)
     hull, reach = spacing.hull_radius, spacing.target_radius
     side, drawn = drawing.draw(kind, of, uniforms, present, hull, reach, xp)
