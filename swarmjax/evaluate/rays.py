@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from swarmjax.sim import dispatch, infrared, neighbours
+from swarmjax.sim import infrared, neighbours
 from swarmjax.sim import model as sim_model
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.geometry import FLOOR_GROUP, HULL_GROUP
@@ -132,15 +132,14 @@ def _near(
 def _apart_from_robots(scene: RayScene, middle: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Computes distances [A, R, K, N], m, from middles of rays to other robots that may be near."""
     robots, hull = place.shape[-2], scene.robot.hull_radius
-    if dispatch.has_cells(robots, neighbours.ROWS * neighbours.room(hull, scene.reach)):
-        near = [neighbours.find(each, hull, scene.reach, np) for each in place]
-        if not any(each.full for each in near):
-            listed = [each[found.index] for each, found in zip(place, near, strict=True)]
-            index = np.stack([each.index for each in near])
-            myself = index == np.arange(robots)[:, None]
-            apart = np.linalg.norm(middle[..., None, :] - np.stack(listed)[:, :, None], axis=-1)
-            return np.where(myself[:, :, None], np.inf, apart)
-    return np.where(np.eye(robots, dtype=bool)[:, None], np.inf, _apart(middle, place))
+    near = [neighbours.look(each, hull, scene.reach, np) for each in place]
+    index = [each.index for each in near if each is not None and not each.full]
+    if len(index) < len(place) or not index:
+        return np.where(np.eye(robots, dtype=bool)[:, None], np.inf, _apart(middle, place))
+    listed = np.stack([each[found] for each, found in zip(place, index, strict=True)])
+    myself = np.stack(index) == np.arange(robots)[:, None]
+    apart = np.linalg.norm(middle[..., None, :] - listed[:, :, None], axis=-1)
+    return np.where(myself[:, :, None], np.inf, apart)
 
 
 def _apart(ray: np.ndarray, thing: np.ndarray) -> np.ndarray:

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from swarmjax.sim import dispatch
+
 Array = Any
 # A robot looks at three rows of cells. A row is as high as the reach. Cells along a row are narrow,
 # so that those that a robot looks at extend little beyond its reach.
@@ -45,6 +47,13 @@ def room(hull_radius: float, limit: float) -> int:
     apart = (1.0 - _OVERLAP) * 2.0 * hull_radius
     dense = 2.0 * width * height / (math.sqrt(3.0) * apart**2)
     return math.floor(dense + (width + height) / apart + 1.0)
+
+
+def look(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near | None:
+    """Lists the robots near each robot as `find` does; None for a swarm that compares all pairs."""
+    if not dispatch.has_cells(len(pose), ROWS * room(hull_radius, limit)):
+        return None
+    return find(pose, hull_radius, limit, xp)
 
 
 def find(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near:

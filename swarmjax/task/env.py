@@ -111,7 +111,8 @@ def reset(world: World, level: Level) -> EnvState:
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     goal, target = world.goal.begin(level)
     level = level._replace(target=target)
-    near = _neighbours(world, level.start)
+    hull, reach = world.robot.hull_radius, world.electronics.reach
+    near = neighbours.look(level.start, hull, reach, jnp)
     sight = _look(world, level.start, level, factors, near)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
@@ -172,11 +173,10 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       The new state, and the outcome of the step.
     """
     chex.assert_shape(action, (state.level.present.shape[0], sim_drive.ACTION_SIZE))
-    level = state.level
-    active = level.present & world.goal.drives(state.arrived)
+    active = state.level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, near, sound = _move(world, state, action, active)
-    looked = _look(world, pose, level, state.factors, near)  # at the targets of before
+    looked = _look(world, pose, state.level, state.factors, near)  # at the targets of before
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
@@ -196,9 +196,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
         apart=apart,
         path=_measure_path(world, level, state.path, pose),
     )
-    begun = begins & active[:, None]
     earns = ends if turn.earns is None else turn.earns
-    earned = _reward_step(world, state, after, looked, earns, begun, pose, action)
+    earned = _reward_step(world, state, after, looked, earns, begins, pose, action)
     gained = reward.total(earned, world.task.reward, world.terms)
     sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
     sound &= _is_finite(seen, level.present[:, None])
@@ -235,14 +234,6 @@ def _turn(
     return turn, state.level._replace(target=turn.target), sight
 
 
-def _neighbours(world: World, pose: Array) -> Near | None:
-    """Lists the robots that each robot may see or touch; None compares all pairs."""
-    hull, reach = world.robot.hull_radius, world.electronics.reach
-    if not dispatch.has_cells(len(pose), neighbours.ROWS * neighbours.room(hull, reach)):
-        return None
-    return neighbours.find(pose, hull, reach, jnp)
-
-
 def _count_contacts(
     world: World, state: EnvState, pose: Array, near: Near | None
 ) -> tuple[Array, Array]:
@@ -270,7 +261,7 @@ def _reward_step(
         infrared=sight.ray,
         sensor_range=world.robot.sensor_range,
         arrives=arrives,
-        contact_begins=begins,
+        contact_begins=begins & world.goal.drives(before.arrived)[:, None],
         touching=after.apart == 0.0,
         outside=world.goal.is_under_way(before.arrived),
     )
@@ -312,7 +303,8 @@ def _move(
     # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
     pose = jnp.where(sound, after, before)
-    near = _neighbours(world, pose)
+    hull, reach = world.robot.hull_radius, world.electronics.reach
+    near = neighbours.look(pose, hull, reach, jnp)
     return data, memory, pose, near, sound if near is None else sound & ~near.full
 
 

@@ -127,7 +127,7 @@ class StageConfig(Section):
             )
         if not re.fullmatch(r"[\w-]+", self.name):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
-        if self.level != "plots":
+        if self.level != "plots" or self.distance is not None:
             self._check_number()
         self._check_fixed()
         self._check_keys(LAYOUTS.get(self.level))
@@ -143,13 +143,16 @@ class StageConfig(Section):
             )
 
     def _check_number(self) -> None:
-        """Refuses numbers that are too large for levels in which everything is placed in turn."""
+        """Refuses numbers too large for levels whose objects or starts are placed in turn."""
         most = {"robots": _MOST_ROBOTS, "side": _LARGEST_SIDE, "obstacles": _MOST_OBSTACLES}
         for key, limit in most.items():
             if (self.sides[1] if key == "side" else getattr(self, key)) > limit:
+                reason, other = f"level is {self.level}", "level=plots"
+                if self.level == "plots":
+                    reason, other = f"distance is {show(self.distance)}", "no distance"
                 raise ConfigError(
-                    f"{key} is {show(getattr(self, key))}, but level is {self.level}: give at most "
-                    f"{limit:g}, or level=plots."
+                    f"{key} is {show(getattr(self, key))}, but {reason}: give at most {limit:g}, "
+                    f"or {other}."
                 )
 
     def _check_fixed(self) -> None:

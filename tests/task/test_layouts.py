@@ -404,6 +404,11 @@ def _change(name: str, **changed: Any) -> None:
             "side is 3, too small for robots=200 and obstacles=50 on plots: give at least 4.4.",
         ),
         ("crowd", {"robots": 101}, "robots is 101, but level is crowd: give at most 100, or level"),
+        (
+            "plots",
+            {"robots": 20, "obstacles": 5, "side": 5.0, "distance": 0.5},
+            "side is 5, but distance is 0.5: give at most 4, or no distance.",
+        ),
         ("maze", {"side": 5.0}, "side is 5, but level is maze: give at most 4, or level=plots."),
     ],
 )
