@@ -133,8 +133,9 @@ def environment(
 
     def body(arenas: rollout.Arena, key: Array, starts: rollout.Arena) -> tuple[Any, Any]:
         arenas, came = step(arenas, _actions(program, key))
-        reward = jnp.sum(came.reward) + jnp.sum(came.observation)
-        sums = {"reward": reward, "episodes_ended": jnp.sum(came.done, dtype=jnp.int32)}
+        # A sum over all arenas in every step would be a kernel with a single block.
+        reward = jnp.sum(came.reward, axis=-1) + jnp.sum(came.observation, axis=(-2, -1))
+        sums = {"reward": reward, "episodes_ended": came.done.astype(jnp.int32)}
         return rollout.restart(arenas, starts, came.done), sums
 
     def rolled(arenas: rollout.Arena, key: Array) -> tuple[Any, Any]:

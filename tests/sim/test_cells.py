@@ -11,20 +11,25 @@ import warp as wp
 from jax import Array
 
 from swarmjax.sim import engine
-from swarmjax.sim.fast import contacts_warp, planar_warp, rubbing_warp
-from swarmjax.sim.fast.contacts_warp import WarpArena
+from swarmjax.sim.fast import contacts_warp, gaps_warp, planar_warp, rubbing_warp
 from swarmjax.sim.fast.discs import DiscRobots, Discs
+from swarmjax.sim.fast.gaps_warp import WarpArena
 from swarmjax.task import level
 
 engine.quiet_warp()
 RADIUS, ROOM = np.float32(0.037), 2000  # m, contacts of an arena
-CELL = contacts_warp.CELL * RADIUS
-NUMBERS = jnp.asarray(np.array([RADIUS, *np.ones(9)], np.float32))
+CELL = gaps_warp.CELL * RADIUS
+NUMBERS = jnp.asarray(np.array([RADIUS, *np.ones(10)], np.float32))
 Scene = Callable[[np.random.Generator, int, int], np.ndarray]
 
 
 @wp.func
-def _count(arena: WarpArena, count: int) -> None:
+def _count(arena: WarpArena, first: int) -> None:
+    """Counts the contacts of a lane."""
+    k, count = wp.int32(first), wp.int32(0)
+    while k >= 0:
+        count += 1
+        k = arena.after[k, arena.index]
     arena.total[0] = wp.vec3(float(count), 0.0, 0.0)
 
 
@@ -34,11 +39,12 @@ ALL_PAIRS = contacts_warp.kernels_of(_count)[0]
 def _by_pairs(place: Array, side: Array, obstacle: Array) -> tuple[Array, Array]:
     """Returns the number of contacts [A], and their rows [2, K, A, 4]."""
     arenas, robots = place.shape[:2]
-    still = jnp.zeros((arenas, 3, robots, 3))
-    given = place, still[:, 0], still, side, obstacle, NUMBERS
+    motion = jnp.repeat(place[:, None], 5, axis=1)
+    given = motion, side, obstacle, NUMBERS
     shapes = {"contact": (2, ROOM, arenas), "total": (arenas, robots)}
-    call = wp.jax_kernel(ALL_PAIRS, num_outputs=2)
-    contact, total = call(*given, launch_dims=arenas, output_dims=shapes)
+    shapes |= {"island": (arenas, robots), "after": (ROOM, arenas)}
+    call = wp.jax_kernel(ALL_PAIRS, num_outputs=4)
+    contact, total, *_ = call(*given, launch_dims=(arenas, 1), output_dims=shapes)
     return total[:, 0, 0].astype(int), contact
 
 
@@ -97,7 +103,7 @@ def _check(scene: Scene, arenas: int, robots: int, obstacles: int) -> np.ndarray
     given = jnp.asarray(place), side, obstacle
     number, expected = map(np.asarray, _by_pairs(*given))
     shape = (2, ROOM, arenas)
-    found, contact = contacts_warp.list_by_cells(shape, float(RADIUS), *given, NUMBERS)
+    found, contact = gaps_warp.list_by_cells(shape, float(RADIUS), *given, NUMBERS)
     np.testing.assert_array_equal(found, number)
     assert number.max() < ROOM
     listed = np.arange(ROOM)[:, None] < number

@@ -1,45 +1,49 @@
 """Forces between planar robots without friction, in Warp.
 
-`discs` describes the problem, `contacts_warp` the kernel. A thread sweeps through the contacts of
-its arena until no force changes.
+`discs` describes the problem, `contacts_warp` the kernel. A lane sweeps through its contacts until
+no force changes.
 """
 
 import functools
 
 import warp as wp
 
-from swarmjax.sim.fast import contacts_warp, discs
-from swarmjax.sim.fast.contacts_warp import WarpArena
+from swarmjax.sim.fast import contacts_warp, discs, gaps_warp
+from swarmjax.sim.fast.gaps_warp import WarpArena
 
 _TOLERANCE = wp.constant(discs.TOLERANCE)
 
 
 @wp.func
-def _solve(arena: WarpArena, count: int) -> None:
+def _solve(arena: WarpArena, first: int) -> None:
     """Finds the forces, and the accelerations that they cause.
 
     Row 0 of a contact becomes x, y, aref, and J M^-1 J' + R. Row 1 becomes R, the force (N), and
     both robots.
     """
-    for k in range(count):
+    k = wp.int32(first)
+    while k >= 0:
         _begin(arena, k)
+        k = arena.after[k, arena.index]
     done = wp.int32(0)
     moves = wp.bool(True)
     while moves and done < int(arena.numbers[9]):
-        moves = _sweep(arena, count)
+        moves = _sweep(arena, first)
         done += 1
     # Recompute the accelerations from the forces, without the rounding of the sweeps.
-    contacts_warp.let_go(arena)
-    for k in range(count):
+    contacts_warp.let_go(arena, first)
+    k = first
+    while k >= 0:
         held = arena.contact[1, k, arena.index]
-        _push(arena, arena.contact[0, k, arena.index], contacts_warp.sides_of(held), held[1])
+        _push(arena, arena.contact[0, k, arena.index], gaps_warp.sides_of(held), held[1])
+        k = arena.after[k, arena.index]
 
 
 @wp.func
 def _begin(arena: WarpArena, k: int) -> None:
     """Computes the parameters of a contact, and starts with an initial force."""
     gap = arena.contact[0, k, arena.index]
-    sides = contacts_warp.sides_of(arena.contact[1, k, arena.index])
+    sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
     body = contacts_warp.body_of(arena, sides)
     impedance = contacts_warp.impedance_at(arena.numbers, -gap[2])
     give = contacts_warp.give_at(body[1], impedance)
@@ -72,14 +76,15 @@ def _push(arena: WarpArena, row: wp.vec4, sides: wp.vec2i, force: float) -> None
 
 
 @wp.func
-def _sweep(arena: WarpArena, count: int) -> bool:
+def _sweep(arena: WarpArena, first: int) -> bool:
     """Sets each force to its best value, given the others; returns whether any force changed."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
-    for k in range(count):
+    k = wp.int32(first)
+    while k >= 0:
         row = arena.contact[0, k, arena.index]
         held = arena.contact[1, k, arena.index]
-        sides = contacts_warp.sides_of(held)
+        sides = gaps_warp.sides_of(held)
         along = _along(arena.total, row, sides)
         more = wp.max((row[2] - along - held[0] * held[1]) / row[3], -held[1])
         force = held[1] + more
@@ -87,6 +92,7 @@ def _sweep(arena: WarpArena, count: int) -> bool:
         _push(arena, row, sides, more)
         largest = wp.max(largest, force)
         change = wp.max(change, wp.abs(more))
+        k = arena.after[k, arena.index]
     return change > _TOLERANCE * largest
 
 

@@ -7,9 +7,9 @@ import functools
 
 import warp as wp
 
-from swarmjax.sim.fast import contacts_warp
-from swarmjax.sim.fast.contacts_warp import WarpArena
+from swarmjax.sim.fast import contacts_warp, gaps_warp
 from swarmjax.sim.fast.discs import TOLERANCE
+from swarmjax.sim.fast.gaps_warp import WarpArena
 from swarmjax.sim.fast.rubbing_jax import FLOOR, KEPT, ROUNDING
 
 _TOLERANCE = wp.constant(TOLERANCE)
@@ -46,40 +46,44 @@ class WarpSwept:
 
 
 @wp.func
-def _solve(arena: WarpArena, count: int) -> None:
+def _solve(arena: WarpArena, first: int) -> None:
     """Sweeps until no force changes, with leaps in between (`rubbing_jax.solve`).
 
     Row 0 of a contact becomes x, y, its arm (m), and R. Row 1 becomes push and rub (N), and both
     robots. Row 2 is aref of push and rub, and J M^-1 J' + R of both. The last `KEPT` rows are push
     and rub after a sweep, and their changes in that sweep; sweep i is in row i modulo `KEPT`.
     """
-    for k in range(count):
+    k = wp.int32(first)
+    while k >= 0:
         _begin(arena, k)
+        k = arena.after[k, arena.index]
     sweeps = int(arena.numbers[9])
     done = wp.int32(0)
     size = wp.float32(0.0)
     moves = done < sweeps
-    least = _least_change(arena, count)
+    least = _least_change(arena, first)
     while moves and done < sweeps:
-        swept = _sweep(arena, count, done, least)
+        swept = _sweep(arena, first, done, least)
         moves = swept.moves
         done += 1
         if moves and done >= _KEPT and 2 * done <= sweeps and swept.size <= size:
-            _leap(arena, count, done - 1, _weights(swept))
+            _leap(arena, first, done - 1, _weights(swept))
         size = swept.size
     # Recompute the accelerations from the forces, without the rounding of the sweeps.
-    contacts_warp.let_go(arena)
-    for k in range(count):
+    contacts_warp.let_go(arena, first)
+    k = first
+    while k >= 0:
         held = arena.contact[1, k, arena.index]
         force = wp.vec2(held[0], held[1])
-        _push(arena, arena.contact[0, k, arena.index], contacts_warp.sides_of(held), force)
+        _push(arena, arena.contact[0, k, arena.index], gaps_warp.sides_of(held), force)
+        k = arena.after[k, arena.index]
 
 
 @wp.func
 def _begin(arena: WarpArena, k: int) -> None:
     """Computes the parameters of a contact, and starts with initial forces."""
     gap = arena.contact[0, k, arena.index]
-    sides = contacts_warp.sides_of(arena.contact[1, k, arena.index])
+    sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
     body = contacts_warp.body_of(arena, sides)
     impedance = contacts_warp.impedance_at(arena.numbers, -gap[2])
     give = contacts_warp.give_at(body[1], impedance)
@@ -155,29 +159,32 @@ def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec
 
 
 @wp.func
-def _least_change(arena: WarpArena, count: int) -> float:
+def _least_change(arena: WarpArena, first: int) -> float:
     """Returns the force, N, that rounding can cause, as in `rubbing_jax`."""
     largest = wp.float32(0.0)
-    for k in range(count):
-        sides = contacts_warp.sides_of(arena.contact[1, k, arena.index])
+    k = wp.int32(first)
+    while k >= 0:
+        sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
         apart = _apart(arena.free, sides)
         turn = arena.contact[0, k, arena.index][2] * wp.abs(apart[2])
         size = wp.abs(apart[0]) + wp.abs(apart[1]) + turn
         largest = wp.max(largest, size / arena.contact[2, k, arena.index][2])
+        k = arena.after[k, arena.index]
     return _FLOOR * largest
 
 
 @wp.func
-def _sweep(arena: WarpArena, count: int, index: int, least: float) -> WarpSwept:
+def _sweep(arena: WarpArena, first: int, index: int, least: float) -> WarpSwept:
     """Sets all forces to their best values, contact by contact."""
     swept = WarpSwept()
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
-    for k in range(count):
+    k = wp.int32(first)
+    while k >= 0:
         row = arena.contact[0, k, arena.index]
         force = arena.contact[1, k, arena.index]
         asked = arena.contact[2, k, arena.index]
-        sides = contacts_warp.sides_of(force)
+        sides = gaps_warp.sides_of(force)
         speed = _slide(arena.total, row, sides)
         push = (asked[0] - speed[0] - row[3] * force[0]) / asked[2]
         rub = (asked[1] - speed[1] - row[3] * force[1]) / asked[3]
@@ -189,6 +196,7 @@ def _sweep(arena: WarpArena, count: int, index: int, least: float) -> WarpSwept:
         largest = wp.max(largest, best[0])
         change = wp.max(change, wp.max(wp.abs(more[0]), wp.abs(more[1])))
         swept = _remember(arena, swept, k, index, wp.vec4(best[0], best[1], more[0], more[1]))
+        k = arena.after[k, arena.index]
     swept.moves = change > wp.max(_TOLERANCE * largest, least)
     return swept
 
@@ -225,9 +233,10 @@ def _weights(swept: WarpSwept) -> wp.vec2:
 
 
 @wp.func
-def _leap(arena: WarpArena, count: int, index: int, weights: wp.vec2) -> None:
+def _leap(arena: WarpArena, first: int, index: int, weights: wp.vec2) -> None:
     """Continues from the mix of the last three sweeps' forces that should change least."""
-    for k in range(count):
+    k = wp.int32(first)
+    while k >= 0:
         force = arena.contact[1, k, arena.index]
         asked = arena.contact[2, k, arena.index]
         last = arena.contact[_PAST + (index + 2) % _KEPT, k, arena.index]
@@ -236,10 +245,11 @@ def _leap(arena: WarpArena, count: int, index: int, weights: wp.vec2) -> None:
         rub = weights[0] * (force[1] - last[1]) + weights[1] * (last[1] - before[1])
         wanted = wp.vec2(force[0] - push, force[1] - rub)
         mixed = _project(wanted, asked[2], asked[3], arena.numbers[8])
-        sides = contacts_warp.sides_of(force)
+        sides = gaps_warp.sides_of(force)
         _hold(arena, k, mixed, sides)
         more = wp.vec2(mixed[0] - force[0], mixed[1] - force[1])
         _push(arena, arena.contact[0, k, arena.index], sides, more)
+        k = arena.after[k, arena.index]
 
 
 push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernels_of(_solve), _PAST + KEPT)

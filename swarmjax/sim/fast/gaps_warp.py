@@ -1,0 +1,324 @@
+"""Which robots touch each other, obstacles and walls: lists of contacts, in Warp.
+
+Several threads, called lanes, compare all pairs of an arena. For large swarms, one thread per
+obstacle, wall and robot looks into the cells around it (`cells_warp`). Both list the same contacts
+in the same order.
+"""
+
+# Warp's types know neither the arguments of a struct nor the argument `module`.
+# pyright: reportCallIssue=false
+
+import jax.numpy as jnp
+import warp as wp
+from jax import Array
+
+from swarmjax.sim import model as sim_model
+from swarmjax.sim.fast import cells_warp
+from swarmjax.sim.fast import discs as sim_discs
+
+# Edge of a cell in radii: 5 % more than a hull's diameter, for rounding.
+CELL = wp.constant(2.1)
+_DEEPEST = wp.constant(sim_discs.DEEPEST)
+_WALLS = wp.constant(sim_model.WALLS)
+_THICKNESS = wp.constant(sim_model.WALL_HALF_THICKNESS)
+_LENGTH = wp.constant(sim_model.WALL_HALF_LENGTH)
+
+
+def list_by_cells(
+    shape: tuple[int, int, int],
+    radius: float,
+    place: Array,
+    side: Array,
+    obstacle: Array,
+    numbers: Array,
+) -> tuple[Array, Array]:
+    """Lists the contacts of many arenas as `list_contacts` does, by looking into cells.
+
+    Args:
+      shape: N, K, A.
+      radius: radius of the hulls, m.
+      place: [A, R, 3] x (m), y (m), yaw (rad).
+      side: [A] m.
+      obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
+      numbers: as in `WarpArena`.
+
+    Returns:
+      [A] number of contacts, which may be larger than K, and [N, K, A, 4] their rows 0 and 1, as in
+      `WarpArena`.
+    """
+    arenas, robots = place.shape[:2]
+    owners, width = (arenas, obstacle.shape[1] + sim_model.WALLS + robots), CELL * radius
+    call = wp.jax_kernel(_list_near, num_outputs=2, in_out_argnames=["count"])
+    given = place, side, obstacle, numbers, *cells_warp.chain(place, width)
+
+    def run(start: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
+        return call(*given, start, launch_dims=owners, output_dims={"contact": shape})
+
+    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # no room to list any
+    end = jnp.cumsum(count, axis=1)
+    return end[:, -1], run(end - count, shape)[1]
+
+
+@wp.struct
+class WarpArena:
+    """Arrays of an arena, which one thread reads and writes.
+
+    Attributes:
+      place: [R] x, y (m), yaw (rad).
+      rate: [R] velocity of `place`, 1/s.
+      free: [R] acceleration of `place` without contacts, 1/s^2.
+      before: [R] acceleration of `place` in the previous step, 1/s^2.
+      body: [R] 1 / mass, inverse weight, 1 / moment of inertia.
+      side: side of the arena, m.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
+      numbers: radius (m), stiffness (1/s^2), damping (1/s), `solimp` (5), friction, largest number
+        of sweeps, number of lanes.
+      contact: [N, K, A] numbers of each contact of all arenas. Row 0 is x and y of the unit vector
+        along which it pushes, and two numbers of the solver; at first, the third is the gap, m. Row
+        1 is two numbers of the solver, the robot pushed along the vector, and the robot pushed
+        back; -1 for none. All other rows are the solver's.
+      total: [R] acceleration of x, y and yaw under the current forces.
+      island: [R] the first robot of each robot's island.
+      after: [K, A] the contact that a lane solves after each contact of all arenas; -1 for none.
+      lanes: number of threads of the arena.
+      index: index of the arena.
+    """
+
+    place: wp.array[wp.vec3]
+    rate: wp.array[wp.vec3]
+    free: wp.array[wp.vec3]
+    before: wp.array[wp.vec3]
+    body: wp.array[wp.vec3]
+    side: float
+    obstacle: wp.array2d[float]
+    numbers: wp.array[float]
+    contact: wp.array3d[wp.vec4]
+    total: wp.array[wp.vec3]
+    island: wp.array[int]
+    after: wp.array2d[int]
+    lanes: int
+    index: int
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned first = threadIdx.x % 32 / lanes * lanes;
+    unsigned arena = (0xffffffffu >> (32 - lanes)) << first;
+    __syncwarp(arena);
+    return (__ballot_sync(arena, yes) & arena) >> first;
+#else
+    return yes;
+#endif
+""")
+def vote(yes: bool, lanes: int) -> wp.uint32:
+    """Waits until all lanes of an arena have written their results; returns a bit for each."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+""")
+def ones(bits: wp.uint32) -> int:
+    """Counts bits that are 1."""
+    ...
+
+
+@wp.func
+def list_contacts(arena: WarpArena, lane: int) -> int:
+    """Lists the contacts with obstacles, walls and other robots; returns their number."""
+    robots, fixtures = arena.place.shape[0], arena.obstacle.shape[0] + _WALLS
+    gaps, before = robots * (fixtures + robots), (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
+    count = wp.int32(0)
+    for start in range(0, gaps, arena.lanes):
+        owner = (start + lane) // robots
+        robot = start + lane - owner * robots
+        gap = wp.vec3(0.0, 0.0, 1.0)
+        if owner < fixtures + robots:
+            box = _box_of(arena, owner, 0.0)
+            gap = _gap_to(arena, box, owner - fixtures, robot)
+        closed = vote(gap[2] < 0.0, arena.lanes)
+        if gap[2] < 0.0:
+            _list_gap(arena, count + ones(closed & before), gap, owner - fixtures, robot)
+        count += ones(closed)
+    return wp.min(count, arena.contact.shape[1])
+
+
+@wp.struct
+class WarpBox:
+    """A rectangle: centre (m), cosine and sine of its yaw, half edges (m)."""
+
+    x: float
+    y: float
+    cos: float
+    sin: float
+    half_x: float
+    half_y: float
+
+
+@wp.kernel(enable_backward=False)
+def _list_near(
+    place: wp.array2d[wp.vec3],
+    side: wp.array[float],
+    obstacle: wp.array3d[float],
+    numbers: wp.array[float],
+    first: wp.array3d[int],
+    after: wp.array2d[int],
+    count: wp.array2d[int],
+    contact: wp.array3d[wp.vec4],
+) -> None:
+    """Lists the contacts of an obstacle, wall or robot with robots, from index `count` on.
+
+    Sets `count` to their number. A robot has contacts only with the robots after it.
+    """
+    i, owner = wp.tid()
+    arena = WarpArena()
+    arena.index = i
+    arena.place = place[i]
+    arena.side = side[i]
+    arena.obstacle = obstacle[i]
+    arena.numbers = numbers
+    arena.contact = contact
+    fixtures, across, width = obstacle.shape[1] + _WALLS, first.shape[1], CELL * numbers[0]
+    start = wp.int32(count[i, owner])
+    box = _box_of(arena, owner, width)
+    reach_x = wp.abs(box.cos) * box.half_x + wp.abs(box.sin) * box.half_y + 0.5 * width
+    reach_y = wp.abs(box.sin) * box.half_x + wp.abs(box.cos) * box.half_y + 0.5 * width
+    x, y = cells_warp.cell_at(box.x - reach_x, width), cells_warp.cell_at(box.y - reach_y, width)
+    # No more columns and rows than the grid has, or a robot would be found twice.
+    end_x = wp.min(cells_warp.cell_at(box.x + reach_x, width) + 1, x + across)
+    end_y = wp.min(cells_warp.cell_at(box.y + reach_y, width) + 1, y + across)
+    known = wp.int32(0)
+    for column in range(x, end_x):
+        for row in range(y, end_y):
+            robot = wp.int32(first[i, column & (across - 1), row & (across - 1)])
+            while robot >= 0:
+                known = _list_robot(arena, start, known, box, owner - fixtures, robot)
+                robot = after[i, robot]
+    count[i, owner] = known
+
+
+@wp.func
+def _list_robot(
+    arena: WarpArena, start: int, count: int, box: WarpBox, owner: int, robot: int
+) -> int:
+    """Lists a robot's contact with a robot before it, or with a box if there is no `owner`.
+
+    The contacts from `start` on are in the order of the robots. Returns their new number.
+    """
+    gap = _gap_to(arena, box, owner, robot)
+    if not (gap[2] < 0.0):
+        return count
+    k = start + count
+    if k < arena.contact.shape[1]:
+        while k > start and _last_robot(arena, k - 1) > robot:
+            arena.contact[0, k, arena.index] = arena.contact[0, k - 1, arena.index]
+            arena.contact[1, k, arena.index] = arena.contact[1, k - 1, arena.index]
+            k -= 1
+        _list_gap(arena, k, gap, owner, robot)
+    return count + 1
+
+
+@wp.func
+def _gap_to(arena: WarpArena, box: WarpBox, owner: int, robot: int) -> wp.vec3:
+    """Returns the gap of a robot to a robot before it, or to a box if there is no `owner`."""
+    if owner < 0:
+        return _from_box(arena.place[robot], box, arena.numbers[0])
+    if owner < robot:
+        return _from_disc(arena, owner, robot)
+    return wp.vec3(0.0, 0.0, 1.0)
+
+
+@wp.func
+def _last_robot(arena: WarpArena, k: int) -> int:
+    """Returns the later robot of a contact."""
+    sides = sides_of(arena.contact[1, k, arena.index])
+    return wp.max(sides[0], sides[1])
+
+
+@wp.func
+def _box_of(arena: WarpArena, owner: int, width: float) -> WarpBox:
+    """Returns an obstacle, a wall, or a square of this width around a robot, in this order."""
+    obstacles = arena.obstacle.shape[0]
+    if owner < obstacles:
+        return _obstacle_box(arena, owner)
+    if owner < obstacles + _WALLS:
+        return _wall_box(arena.side, owner - obstacles)
+    place = arena.place[owner - obstacles - _WALLS]
+    return WarpBox(place[0], place[1], 1.0, 0.0, 0.5 * width, 0.5 * width)
+
+
+@wp.func
+def _obstacle_box(arena: WarpArena, m: int) -> WarpBox:
+    """Returns an obstacle."""
+    x, y, yaw = arena.obstacle[m, 0], arena.obstacle[m, 1], arena.obstacle[m, 2]
+    return WarpBox(x, y, wp.cos(yaw), wp.sin(yaw), arena.obstacle[m, 3], arena.obstacle[m, 4])
+
+
+@wp.func
+def _wall_box(side: float, k: int) -> WarpBox:
+    """Returns the east, north, west or south wall, as in `model.fixture_rectangles`."""
+    cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
+    sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
+    away = 0.5 * side + _THICKNESS
+    return WarpBox(away * cos, away * sin, cos, sin, _THICKNESS, _LENGTH)
+
+
+@wp.func
+def _list_gap(arena: WarpArena, k: int, gap: wp.vec3, owner: int, robot: int) -> None:
+    """Lists a contact of a robot with a robot before it, or with a box if there is no `owner`."""
+    if k < arena.contact.shape[1]:
+        first, second = wp.where(owner < 0, robot, owner), wp.where(owner < 0, -1, robot)
+        arena.contact[0, k, arena.index] = wp.vec4(gap[0], gap[1], gap[2], 0.0)
+        arena.contact[1, k, arena.index] = wp.vec4(0.0, 0.0, float(first), float(second))
+
+
+@wp.func
+def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
+    """Returns x and y of the unit vector from a box to a robot, and the gap between them, m.
+
+    The gap is measured from the box's point nearest to the hull's centre. A centre within the box
+    has no such point, so its gap is measured from the nearest face, unless that face is the top or
+    the bottom (`discs.DEEPEST`).
+    """
+    away_x, away_y = place[0] - box.x, place[1] - box.y
+    x = box.cos * away_x + box.sin * away_y
+    y = box.cos * away_y - box.sin * away_x
+    over_x, over_y = wp.abs(x) - box.half_x, wp.abs(y) - box.half_y
+    along = wp.vec2(wp.max(over_x, 0.0), wp.max(over_y, 0.0))
+    distance = wp.length(along)
+    depth = -wp.max(over_x, over_y)
+    if depth >= 0.0:
+        along = wp.where(over_x > over_y, wp.vec2(1.0, 0.0), wp.vec2(0.0, 1.0))
+        distance = wp.where(depth > _DEEPEST, radius, -depth)
+    along = wp.normalize(along)
+    # A centre midway between two faces is pushed out through the face at the negative end.
+    along_x = wp.where(x > 0.0, along[0], -along[0])
+    along_y = wp.where(y > 0.0, along[1], -along[1])
+    world_x = box.cos * along_x - box.sin * along_y
+    world_y = box.sin * along_x + box.cos * along_y
+    return wp.vec3(world_x, world_y, distance - radius)
+
+
+@wp.func
+def _from_disc(arena: WarpArena, i: int, j: int) -> wp.vec3:
+    """Returns the unit vector from the second robot to the first, and their gap, m.
+
+    Two hulls at the same place push each other along x, as in MuJoCo. The first is pushed towards
+    negative x.
+    """
+    away = arena.place[i] - arena.place[j]
+    apart = wp.length(wp.vec2(away[0], away[1]))
+    along = wp.vec2(-1.0, 0.0)
+    if apart > 0.0:
+        along = wp.vec2(away[0] / apart, away[1] / apart)
+    return wp.vec3(along[0], along[1], apart - 2.0 * arena.numbers[0])
+
+
+@wp.func
+def sides_of(held: wp.vec4) -> wp.vec2i:
+    """Returns the robots of a contact, given its row 1."""
+    return wp.vec2i(int(held[2]), int(held[3]))
