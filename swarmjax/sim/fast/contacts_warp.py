@@ -80,8 +80,8 @@ def _launch(
     shapes = {"total": (arenas, count), "island": (arenas, count), "after": (contacts, arenas)}
     room, dims = (rows, contacts, arenas), {"launch_dims": (arenas, lanes)}
     if count <= MANY:
-        shapes["contact"] = room
-        return call(few)(motion, side, obstacle, numbers, output_dims=shapes, **dims)[1]
+        given, made = (motion, side, obstacle, numbers), shapes | {"contact": room}
+        return call(few)(*given, output_dims=made, **dims)[1]
     listed, contact = gaps_warp.list_by_cells(
         room, discs.radius, robots.place, side, obstacle, numbers
     )
