@@ -195,9 +195,9 @@ def _deal_out(arena: WarpArena, count: int, lane: int) -> int:
     for i in range(lane, arena.free.shape[0], arena.lanes):
         arena.total[i] = arena.free[i]
         arena.island[i] = i
-    moves = gaps_warp.vote(count > 0 and arena.lanes > 1, arena.lanes)
-    while moves != wp.uint32(0):
-        moves = gaps_warp.vote(_join(arena, count, lane), arena.lanes)
+    if arena.lanes > 1:
+        while gaps_warp.any_votes(_join(arena, count, lane)):
+            pass
     first = wp.int32(-1)
     for j in range(count):
         k = count - 1 - j

@@ -102,16 +102,29 @@ class WarpArena:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    unsigned first = threadIdx.x % 32 / lanes * lanes;
-    unsigned arena = (0xffffffffu >> (32 - lanes)) << first;
-    __syncwarp(arena);
-    return (__ballot_sync(arena, yes) & arena) >> first;
+    if (lanes > 1) {
+        unsigned first = threadIdx.x % 32 / lanes * lanes;
+        __syncwarp();
+        return (__ballot_sync(0xffffffffu, yes) >> first) & (0xffffffffu >> (32 - lanes));
+    }
+#endif
+    return yes;
+""")
+def vote(yes: bool, lanes: int) -> wp.uint32:
+    """Waits until all lanes have written their results; returns a bit for each of the arena."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+    return __any_sync(0xffffffffu, yes);
 #else
     return yes;
 #endif
 """)
-def vote(yes: bool, lanes: int) -> wp.uint32:
-    """Waits until all lanes of an arena have written their results; returns a bit for each."""
+def any_votes(yes: bool) -> bool:
+    """Waits as `vote` does; returns whether any lane of the warp, of any arena, says yes."""
     ...
 
 
@@ -132,18 +145,21 @@ def list_contacts(arena: WarpArena, lane: int) -> int:
     """Lists the contacts with obstacles, walls and other robots; returns their number."""
     robots, fixtures = arena.place.shape[0], arena.obstacle.shape[0] + _WALLS
     gaps, before = robots * (fixtures + robots), (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
-    count = wp.int32(0)
+    count, owner, robot = wp.int32(0), wp.int32(lane // robots), wp.int32(lane % robots)
+    box = _box_of(arena, owner % (fixtures + robots), 0.0)
     for start in range(0, gaps, arena.lanes):
-        owner = (start + lane) // robots
-        robot = start + lane - owner * robots
         gap = wp.vec3(0.0, 0.0, 1.0)
-        if owner < fixtures + robots:
-            box = _box_of(arena, owner, 0.0)
+        if start + lane < gaps:
             gap = _gap_to(arena, box, owner - fixtures, robot)
         closed = vote(gap[2] < 0.0, arena.lanes)
         if gap[2] < 0.0:
             _list_gap(arena, count + ones(closed & before), gap, owner - fixtures, robot)
         count += ones(closed)
+        robot += arena.lanes
+        if robot >= robots:
+            owner += robot // robots
+            robot = robot % robots
+            box = _box_of(arena, owner % (fixtures + robots), 0.0)
     return wp.min(count, arena.contact.shape[1])
 
 
