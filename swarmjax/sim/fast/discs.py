@@ -172,8 +172,10 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
         "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
-    fields, still = (getattr(model, name) for name in Model.__annotations__), jnp.zeros(model.nv)
-    placed, data = Model(*map(jnp.asarray, fields)), Data(jnp.zeros(model.nq), still, still, still)
+    # `jnp.zeros`, or a change of precision, would be a program that a GPU has to load first.
+    fields = (np.float32(getattr(model, name)) for name in Model.__annotations__)
+    placed, still = Model(*map(jnp.asarray, fields)), jnp.asarray(np.zeros(model.nv, np.float32))
+    data = Data(still, still, still, still)  # as many positions as velocities
     return Engine(label, placed, data, functools.partial(step, discs), is_mjx=False)
 
 
