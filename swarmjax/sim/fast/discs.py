@@ -23,6 +23,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -172,11 +173,11 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
         "discs, swarmjax's own planar step of the MJX model (2.4 times as fast as "
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
-    # `jnp.zeros`, or a change of precision, would be a program that a GPU has to load first.
     fields = (np.float32(getattr(model, name)) for name in Model.__annotations__)
-    placed, still = Model(*map(jnp.asarray, fields)), jnp.asarray(np.zeros(model.nv, np.float32))
+    # `jnp.zeros` or `jnp.asarray` would be a program that a GPU has to load first.
+    *fields, still = jax.device_put((*fields, np.zeros(model.nv, np.float32)))
     data = Data(still, still, still, still)  # as many positions as velocities
-    return Engine(label, placed, data, functools.partial(step, discs), is_mjx=False)
+    return Engine(label, Model(*fields), data, functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:
