@@ -39,7 +39,7 @@ ALL_PAIRS = contacts_warp.kernels_of(_count)[0]
 def _by_pairs(place: Array, side: Array, obstacle: Array) -> tuple[Array, Array]:
     """Returns the number of contacts [A], and their rows [2, K, A, 4]."""
     arenas, robots = place.shape[:2]
-    motion = jnp.repeat(place[:, None], 5, axis=1)
+    motion = jnp.zeros((arenas, 5, robots, 3)).at[:, 0].set(place)
     given = motion, side, obstacle, NUMBERS
     shapes = {"contact": (2, ROOM, arenas), "total": (arenas, robots)}
     shapes |= {"island": (arenas, robots), "after": (ROOM, arenas)}
