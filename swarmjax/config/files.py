@@ -187,9 +187,11 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     if choice not in names:
         # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
-        hint = f" (nearest: {near[0]})" if near else ""
+        hint = f"give {near[0]}, the nearest, or" if near else "give"
+        if choice.startswith("[") and key == "stage":
+            hint = f"give stage=curriculum 'stage.sequence={choice}' for several, or"
         file = ", or a file .yaml" if folder in _OWN_FILES else ""
-        raise ConfigError(f"{key} is {show(choice)}: give one of {', '.join(names)}{hint}{file}.")
+        raise ConfigError(f"{key} is {show(choice)}: {hint} one of {', '.join(names)}{file}.")
     return _config_dir() / folder / f"{choice}.yaml"
 
 
@@ -212,10 +214,11 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
     """
     known, derived = section.keys(cls), section.keys(cls, derived=True)
     found = {}
-    for word in overrides:
+    for i, word in enumerate(overrides):
         key, equals, value = word.partition("=")
         if not equals or len(key) > _MOST_KEY or not re.fullmatch(r"\w[\w-]*(\.[\w-]+)*", key):
-            raise ConfigError(f"{show(word)} is not a setting: give key=value.")
+            spaces = " without spaces" if overrides[i + 1 : i + 2] == ["="] else ""
+            raise ConfigError(f"{show(word)} is not a setting: give key=value{spaces}.")
         root = key.partition(".")[0]
         if root not in section.names(cls):
             raise section.unknown_key(root, cls)

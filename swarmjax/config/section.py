@@ -391,8 +391,15 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
     dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
     near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)
     near = near or [dotted[name] for name in difflib.get_close_matches(key, dotted, n=1)]
-    hint = f"did you mean {where}{near[0]}?" if near else f"give one of {', '.join(known)}."
+    near = near or [dotted[name] for name in dotted if len(key) > 1 and _initials(name, key)]
+    meant = f" or {where}".join(near)
+    hint = f"did you mean {where}{meant}?" if near else f"give one of {', '.join(known)}."
     return UnknownKeyError(f"{where}{key} is not a key: {hint}")
+
+
+def _initials(name: str, letters: str) -> bool:
+    """Returns whether letters are the first ones of the last words of a name, as lr in actor_lr."""
+    return "".join(word[0] for word in name.split("_") if word).endswith(letters)
 
 
 def _is_derived(item: dataclasses.Field[Any]) -> bool:

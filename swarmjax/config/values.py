@@ -20,6 +20,7 @@ _NAMES = {
     bool: "true or false",
     types.NoneType: "null",
 }
+_POWERS = {"k": 3, "M": 6, "G": 9}  # of ten
 _LISTS = {
     int: "[64,64]",
     float: "[0.9,0.8]",
@@ -70,7 +71,9 @@ def convert_single(hint: object, value: object, key: str) -> object:
         if len(values := made if isinstance(made, tuple) else ()) == 2 and values[0] > values[1]:
             raise ConfigError(f"{key} is {show(value)}: give the lower number first.")
         return made
-    raise ConfigError(f"{key} is {show(value)}: give {describe(hint)}.")
+    power = re.fullmatch(r"([0-9.]+)([kMG])", value) if isinstance(value, str) else None
+    example = f", as in {power[1]}e{_POWERS[power[2]]}" if power else ""
+    raise ConfigError(f"{key} is {show(value)}: give {describe(hint)}{example}.")
 
 
 def _convert(hint: object, value: object) -> object:
@@ -125,8 +128,9 @@ def describe(hint: object, bounds: str = "") -> str:
     for option in options(hint):
         inner = typing.get_args(option)
         if is_list(option):
-            example = f", as in {_LISTS[inner[0]]}{bounds}" if inner[0] in _LISTS else ""
-            words.append(f"a list{example}")
+            choices = f"[{','.join(map(str, typing.get_args(inner[0])[:2]))}]"
+            example = f"{_LISTS[inner[0]]}{bounds}" if inner[0] in _LISTS else choices
+            words.append(f"a list, as in {example}")
         elif typing.get_origin(option) is dict:
             words.append("values by name")
         elif typing.get_origin(option) is Literal:

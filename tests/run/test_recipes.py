@@ -50,7 +50,7 @@ def test_a_run_holds_the_settings_and_not_the_recipe() -> None:
 def test_an_unknown_recipe_is_refused() -> None:
     known = ", ".join(files.choices("recipes"))
     assert refusal(load_train, ["recipe=world"]) == (
-        f"recipe is 'world': give one of {known} (nearest: worlds), or a file .yaml."
+        f"recipe is 'world': give worlds, the nearest, or one of {known}, or a file .yaml."
     )
 
 
@@ -81,7 +81,7 @@ def test_a_recipe_that_extends_itself_is_refused(own: Path, base: str) -> None:
 @pytest.mark.parametrize(
     ("base", "expected"),
     [
-        ("world", "recipe is 'world': give one of worlds"),
+        ("world", "recipe is 'world': give worlds, the nearest, or one of w"),
         ("[worlds]", "{own}: recipe is ['worlds']: give the name of a recipe, or a file .yaml."),
     ],
 )

@@ -123,6 +123,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["arenas"], "'arenas' is not a setting: give key=value."),
         (["--arenas=3"], "'--arenas=3' is not a setting: give key=value."),
         (["+arenas=3"], "'+arenas=3' is not a setting: give key=value."),
+        (["arenas", "=", "3"], "'arenas' is not a setting: give key=value without spaces."),
         (["a\nb"], "'a\\nb' is not a setting: give key=value."),
         (["hydra/launcher=x"], "'hydra/launcher=x' is not a setting: give key=value."),
         (["arena=3"], "arena is not a key: did you mean arenas?"),
@@ -141,23 +142,28 @@ def test_import_needs_neither_jax_nor_hydra():
         (["algo.hidden_sizes=[64"], "algo.hidden_sizes is '[64', which cannot be read: did not "
          "find expected ',' or ']', line 2, column 1."),
         (["arenas=1,2"], "arenas is '1,2': give a whole number."),
+        (["budget=1M"], "budget is '1M': give a whole number, as in 1e6."),
         (["arenas=${nope}"], "arenas is '${nope}': give a whole number."),
         (["arenas=!!set {1}"], "arenas is '!!set {1}', which cannot be read: it has the tag "
          "'tag:yaml.org,2002:set': remove it."),
         # Groups.
-        (["stage=s7"], f"stage is 's7': give one of {CHOICES} (nearest: s6), or a file .yaml."),
-        (["stage=expand"], f"stage is 'expand': give one of {CHOICES} (nearest: expanded), or a "
-        "file .yaml."),
+        (["stage=s7"], f"stage is 's7': give s6, the nearest, or one of {CHOICES}, or a "
+         "file .yaml."),
+        (["stage=[s1,s2]"], "stage is '[s1,s2]': give stage=curriculum "
+         f"'stage.sequence=[s1,s2]' for several, or one of {CHOICES}, or a file .yaml."),
+        (["lr=1e-3"], "lr is not a key: did you mean algo.critic_learning_rate or "
+         "algo.actor_learning_rate?"),
+        (["stage=expand"], "stage is 'expand': give expanded, the nearest, or one of "
+         f"{CHOICES}, or a file .yaml."),
         (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or a file .yaml."),
-        (["stage=[s1,s2]"], f"stage is '[s1,s2]': give one of {CHOICES}, or a file .yaml."),
         (["stage=null"], f"stage is 'null': give one of {CHOICES}, or a file .yaml."),
         (["robot=legged"], "robot is 'legged': give one of khepera4, paper, planar, planar_v2, "
          "thymio2, wheeled, wheeled_v2, or a file .yaml."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
          "one stage, as in stage=s6 (in a recipe: 'stage: s6', and 'stage.side: 0.9' below it)."),
-        (["stage.sequence=[s1,s9]"], f"stage.sequence is 's9': give one of {CHOICES} (nearest: "
-         "s6), or a file .yaml."),
+        (["stage.sequence=[s1,s9]"], "stage.sequence is 's9': give s6, the nearest, or one of "
+         f"{CHOICES}, or a file .yaml."),
         (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
         (["stage.sequence=s1"], "stage.sequence is 's1': give a list, as in [s1,s2]."),
         (["stage.sequence=[s1,s1]"], "stage names s1 more than once: give each stage once."),

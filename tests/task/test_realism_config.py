@@ -203,8 +203,8 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         # Words.
         (["realism=null"], "realism is 'null': give one of ideal, real, webots, or a "
          "file .yaml."),
-        (["realism=reel"], "realism is 'reel': give one of ideal, real, webots (nearest: real), "
-         "or a file .yaml."),
+        (["realism=reel"], "realism is 'reel': give real, the nearest, or one of ideal, real, "
+         "webots, or a file .yaml."),
         (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
          "realism=webots."),
         (["realism.infrared=counts"], "realism.infrared is 'counts': give ideal, webots or real."),
