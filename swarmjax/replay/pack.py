@@ -21,11 +21,13 @@ import numpy as np
 
 from swarmjax.replay.record import Recording, ReplayEpisode
 
-LENGTH = 2e-4  # m; positions are off by at most half of it
-ANGLE = 1e-3  # rad; headings are off by at most half of it
+# Quanta. Positions (m), headings (rad), and the sum of each reward term since the start are off by
+# at most half of theirs.
+FINE = {"length": 2e-4, "angle": 1e-3, "reward": 1e-4}
+MANY = 100  # robots; the quanta of more are `COARSER` times as large, so that a page stays small
+COARSER = 5
 RAY = 5e-4  # m; a ray is shown with the middle of its interval
 MEASURE = 1e-3  # quantum of a goal's own measures
-REWARD = 1e-4  # quantum of each reward term, summed since the start
 # Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
     "#2f7fd1", "#e06c00", "#1f9d6b", "#c94f9d", "#c9a100",
@@ -46,20 +48,27 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
       A zlib stream.
     """
     listed, tables = [], []
+    quanta = _quanta(max(run.pose.shape[1] for episode in episodes for run in episode.runs))
     for episode in episodes:
         listed.append(_describe(episode) | {"runs": []})
         for recording in episode.runs:
-            columns = _columns(recording, reach)
+            columns = _columns(recording, reach, quanta)
             packed = {name: fold(table) for name, table in columns.items()}
             tables += [planes for planes, _ in packed.values()]
             listed[-1]["runs"].append(
                 _describe_run(recording)
                 | {"series": [[name, columns[name].shape[1], packed[name][1]] for name in packed]}
             )
-    quanta = {"length": LENGTH, "angle": ANGLE, "ray": RAY, "reward": REWARD, "measure": MEASURE}
     header = {**about, "quanta": quanta, "dark": dark(reach), "episodes": listed}
     text = json.dumps(header, allow_nan=False, separators=(",", ":")).encode()
     return zlib.compress(b"".join([len(text).to_bytes(4, "little"), text, *tables]), 9)
+
+
+def _quanta(robots: int) -> dict[str, float]:
+    """Returns the quanta for swarms of at most this many robots, by name."""
+    coarser = COARSER if robots > MANY else 1
+    moving = {name: coarser * size for name, size in FINE.items()}
+    return moving | {"ray": RAY, "measure": MEASURE}
 
 
 def fold(table: np.ndarray) -> tuple[bytes, int]:
@@ -107,28 +116,30 @@ def dark(reach: float) -> int:
     return int(np.ceil(reach / RAY))
 
 
-def _columns(recording: Recording, reach: float) -> dict[str, np.ndarray]:
+def _columns(
+    recording: Recording, reach: float, quanta: Mapping[str, float]
+) -> dict[str, np.ndarray]:
     """Returns the series [N, C] of a run by name, as integers; robots come first in C."""
-    rows = len(recording.pose)
+    rows, length = len(recording.pose), quanta["length"]
     ray = np.where(recording.ray < reach, np.floor(recording.ray / RAY), dark(reach))
     touch = recording.touching @ np.array([1, 2, 4])
     series = {
-        "x": recording.pose[..., 0] / LENGTH,
-        "y": recording.pose[..., 1] / LENGTH,
-        "yaw": recording.pose[..., 2] / ANGLE,
+        "x": recording.pose[..., 0] / length,
+        "y": recording.pose[..., 1] / length,
+        "yaw": recording.pose[..., 2] / quanta["angle"],
         "ray": ray,
         "touch": touch,
         "contacts": recording.contacts,
     }
     latched = (recording.arrival > 0) & (np.arange(rows)[:, None] >= recording.arrival)
     if (recording.target != recording.target[0]).any():
-        series["target"] = recording.target / LENGTH
+        series["target"] = recording.target / length
     if (recording.arrived != latched).any():  # a robot left again, which `arrival` cannot show
         series["arrived"] = recording.arrived.astype(int)
     if recording.measured.size:
         series["measured"] = recording.measured / MEASURE
     for name, term in recording.reward.items():
-        series[f"reward.{name}"] = np.cumsum(term, axis=0) / REWARD
+        series[f"reward.{name}"] = np.cumsum(term, axis=0) / quanta["reward"]
     return {name: np.rint(each).reshape(rows, -1) for name, each in series.items()}
 
 

@@ -4,6 +4,7 @@ import json
 import zlib
 
 import numpy as np
+import pytest
 import replays
 import steering
 from hypothesis import given
@@ -90,6 +91,16 @@ def test_recordings_come_back_to_the_quantum(tmp_path):
         # The header rounds to 1e-5.
         np.testing.assert_allclose(episode["target"], recording.target[0], atol=5.1e-6)
         np.testing.assert_allclose(episode["sensor"], recording.scene.sensor, atol=5.1e-6)
+
+
+def test_large_swarms_have_coarser_quanta():
+    for robots, coarser in ((100, 1), (101, 5)):
+        one = replays.wandering(robots, 3)
+        header, (series,) = _unpack(replay_pack.pack({}, [replays.episode(one)], 0.04))
+        quanta = {"length": 2e-4 * coarser, "angle": 1e-3 * coarser, "reward": 1e-4 * coarser}
+        assert header["quanta"] == pytest.approx(quanta | {"ray": 5e-4, "measure": 1e-3})
+        error = np.abs(series["x"] * quanta["length"] - one.pose[..., 0])
+        assert error.max() <= 0.5 * quanta["length"] + 1e-12
 
 
 def test_sensors_that_are_all_alike_are_listed_once():
