@@ -355,7 +355,7 @@ def wrong(tmp_path: Path) -> None:
         (["policy=none.npz"], "none.npz "),
         (["policy=no*.npz"], "policy is 'no*.npz', and 'no*.npz' matches no "),
         (["policy=policy.npz,p*.npz"], "policy is "),
-        (["policy=policy.npz", "stage=s7"], "stage is 's7': give one of "),
+        (["policy=policy.npz", "stage=s7"], "stage is 's7': give s6, the nearest, or one of "),
         ([], "policy is null and compare is null: give one of them"),
         (["compare=policy.npz"], "compare is 'policy.npz': give two files"),
         (
@@ -381,7 +381,7 @@ def wrong(tmp_path: Path) -> None:
             "scaled.npz was trained on observations that differ from this robot's: its "
             "meta.observation.scale is 2.0, ",
         ),
-        (["policy=policy.npz", "suite=stage"], "suite is 'stage': give one of "),
+        (["policy=policy.npz", "suite=stage"], "suite is 'stage': give stages, the nearest, or one of "),
         (["policy=policy.npz", "suite=no.yaml"], "suite is 'no.yaml', and there is no such file."),
         (["policy=policy.npz", "suite=no.npz"], "suite no.npz cannot be read: "),
         (

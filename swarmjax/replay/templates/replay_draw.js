@@ -41,6 +41,8 @@ function placeArena(width, height, side) {
   };
 }
 
+const MOST_POINTS = 20000; // of all trails together
+
 function drawArena(canvas, scene, run, t, look) {
   const { context, width, height } = fit(canvas);
   const place = placeArena(width, height, scene.side);
@@ -160,8 +162,14 @@ function drawTrail(context, place, scene, run, i, t, look) {
   const end = Math.min(t, run.last);
   context.strokeStyle = look.colours[i];
   context.lineWidth = 1.5;
+  // Trails of a large swarm go through fewer points, always the same ones, so that it plays fluently.
+  const every = Math.ceil(run.robots * look.trail / MOST_POINTS);
+  const frames = [end];
+  for (let at = end - 1; at >= Math.max(0, end - look.trail); at--) {
+    if (at % every === 0) frames.push(at);
+  }
   context.beginPath();
-  for (let at = Math.max(0, end - look.trail); at <= end; at++) {
+  for (const at of frames) {
     const [x, y] = run.pose(i, at);
     context.lineTo(place.x(x), place.y(y));
   }
