@@ -255,7 +255,10 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
     ("text", "reason"),
     [
         ("name: x\n", "cells is missing and has no default: give it."),
-        (_text("name: a, stage: s9, seed: 1000000"), "stage is 's9': give s6, the nearest, or one of "),
+        (
+            _text("name: a, stage: s9, seed: 1000000"),
+            "stage is 's9': give s6, the nearest, or one of ",
+        ),
         (
             _text("name: a, stage: worlds, seed: 1000000"),
             "stage is worlds, which names several stages",

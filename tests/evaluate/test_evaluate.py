@@ -381,7 +381,10 @@ def wrong(tmp_path: Path) -> None:
             "scaled.npz was trained on observations that differ from this robot's: its "
             "meta.observation.scale is 2.0, ",
         ),
-        (["policy=policy.npz", "suite=stage"], "suite is 'stage': give stages, the nearest, or one of "),
+        (
+            ["policy=policy.npz", "suite=stage"],
+            "suite is 'stage': give stages, the nearest, or one of ",
+        ),
         (["policy=policy.npz", "suite=no.yaml"], "suite is 'no.yaml', and there is no such file."),
         (["policy=policy.npz", "suite=no.npz"], "suite no.npz cannot be read: "),
         (
