@@ -128,9 +128,10 @@ def describe(hint: object, bounds: str = "") -> str:
     for option in options(hint):
         inner = typing.get_args(option)
         if is_list(option):
-            choices = f"[{','.join(map(str, typing.get_args(inner[0])[:2]))}]"
-            example = f"{_LISTS[inner[0]]}{bounds}" if inner[0] in _LISTS else choices
-            words.append(f"a list, as in {example}")
+            example = f", as in {_LISTS[inner[0]]}{bounds}" if inner[0] in _LISTS else ""
+            if typing.get_origin(inner[0]) is Literal:
+                example = f", as in [{','.join(typing.get_args(inner[0])[:2])}]"
+            words.append(f"a list{example}")
         elif typing.get_origin(option) is dict:
             words.append("values by name")
         elif typing.get_origin(option) is Literal:

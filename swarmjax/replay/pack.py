@@ -67,8 +67,7 @@ def pack(about: Mapping[str, Any], episodes: Sequence[ReplayEpisode], reach: flo
 def _quanta(robots: int) -> dict[str, float]:
     """Returns the quanta for swarms of at most this many robots, by name."""
     coarser = COARSER if robots > MANY else 1
-    moving = {name: coarser * size for name, size in FINE.items()}
-    return moving | {"ray": RAY, "measure": MEASURE}
+    return {name: coarser * size for name, size in FINE.items()} | {"ray": RAY, "measure": MEASURE}
 
 
 def fold(table: np.ndarray) -> tuple[bytes, int]:

@@ -163,7 +163,7 @@ function drawTrail(context, place, scene, run, i, t, look) {
   context.strokeStyle = look.colours[i];
   context.lineWidth = 1.5;
   // Trails of a large swarm go through fewer points, always the same ones, so that it plays fluently.
-  const every = Math.ceil(run.robots * look.trail / MOST_POINTS);
+  const every = Math.ceil(run.robots * Math.min(look.trail, run.last) / MOST_POINTS);
   const frames = [end];
   for (let at = end - 1; at >= Math.max(0, end - look.trail); at--) {
     if (at % every === 0) frames.push(at);

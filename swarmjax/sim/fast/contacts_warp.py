@@ -1,16 +1,16 @@
 """The contacts of planar robots in Warp, and the kernels around a solver of their forces.
 
-The threads of an arena are called lanes. They list its contacts, and solve for the forces
-(`planar_warp`, and `rubbing_warp` with friction). In a kernel that XLA unrolls over all possible
+The threads of an arena list its contacts, and solve for the forces (`planar_warp`, and
+`rubbing_warp` with friction). In a kernel that XLA unrolls over all possible
 contacts, most of the work would go to contacts that do not exist.
 
 Robots that touch each other, directly or through others, form an island. A force in one island
-changes nothing in another, so each lane solves islands of its own. The fewer arenas there are, the
-more lanes each has, up to the 32 of a CUDA warp. A CPU has one lane.
+changes nothing in another, so each thread solves islands of its own. The fewer arenas there are,
+the more threads each has, up to the 32 of a CUDA warp. On a CPU it has one.
 
 Comparing all pairs of many robots would take too long. For more than `MANY` robots, one thread per
 obstacle, wall and robot lists the contacts with robots in the cells around it (`cells_warp`), in
-the same order. The lanes of the arena then only solve for the forces.
+the same order. The threads of the arena then only solve for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
@@ -37,8 +37,8 @@ from swarmjax.sim.fast.gaps_warp import WarpArena
 
 MANY = 100  # robots; on two cores, cells take less time beyond about this number
 _BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
-_THREADS = 2**17  # threads of all arenas, beyond which more lanes do not help
-_MOST_LANES = 32
+_THREADS = 2**17  # threads of all arenas, beyond which more threads an arena do not help
+_MOST_THREADS = 32
 
 
 def launch(
@@ -71,14 +71,14 @@ def _launch(
     pairs = count * fixtures + count * (count - 1) // 2
     contacts = min(pairs, ROWS_PER_ROBOT * count + fixtures)
     hull = discs.radius, *sim_discs.spring(discs), *discs.solimp, discs.friction
-    lanes = _lanes(arenas)
-    numbers = jnp.asarray(np.array([*hull, discs.sweeps, lanes], np.float32))
+    threads = _threads_each(arenas)
+    numbers = jnp.asarray(np.array([*hull, discs.sweeps, threads], np.float32))
     body = jnp.stack([robots.mobility, robots.weight, robots.agility], axis=-1)
     motion = robots.place, robots.rate, robots.free, robots.before, body
     motion, (few, many) = jnp.stack(motion, axis=1), kernels
     call = functools.partial(wp.jax_kernel, num_outputs=4, block_dim=_BLOCK)
     shapes = {"total": (arenas, count), "island": (arenas, count), "after": (contacts, arenas)}
-    room, dims = (rows, contacts, arenas), {"launch_dims": (arenas, lanes)}
+    room, dims = (rows, contacts, arenas), {"launch_dims": (arenas, threads)}
     if count <= MANY:
         given, made = (motion, side, obstacle, numbers), shapes | {"contact": room}
         return call(few)(*given, output_dims=made, **dims)[1]
@@ -91,11 +91,11 @@ def _launch(
     return jnp.where((listed > contacts)[:, None, None], jnp.nan, total)
 
 
-def _lanes(arenas: int) -> int:
+def _threads_each(arenas: int) -> int:
     """Returns the number of threads of an arena, a power of two."""
     if jax.default_backend() != "gpu":
         return 1
-    return min(_MOST_LANES, 2 ** max(0, (_THREADS // arenas).bit_length() - 1))
+    return min(_MOST_THREADS, 2 ** max(0, (_THREADS // arenas).bit_length() - 1))
 
 
 def kernels_of(solve: Any) -> Any:
@@ -120,11 +120,11 @@ def kernels_of(solve: Any) -> Any:
         island: wp.array2d[int],
         after: wp.array2d[int],
     ) -> None:
-        i, lane = wp.tid()
+        i, thread = wp.tid()
         arena = _arena_of(motion[i], numbers, contact, total[i], island[i], after, i)
         arena.side = side[i]
         arena.obstacle = obstacle[i]
-        first = _deal_out(arena, gaps_warp.list_contacts(arena, lane), lane)
+        first = _deal_out(arena, gaps_warp.list_contacts(arena, thread), thread)
         if first >= 0:
             solve(arena, first)
 
@@ -138,9 +138,9 @@ def kernels_of(solve: Any) -> Any:
         island: wp.array2d[int],
         after: wp.array2d[int],
     ) -> None:
-        i, lane = wp.tid()
+        i, thread = wp.tid()
         arena = _arena_of(motion[i], numbers, contact, total[i], island[i], after, i)
-        first = _deal_out(arena, listed[i], lane)
+        first = _deal_out(arena, listed[i], thread)
         if first >= 0:
             solve(arena, first)
 
@@ -165,7 +165,7 @@ def _arena_of(
     arena.before = motion[3]
     arena.body = motion[4]
     arena.numbers = numbers
-    arena.lanes = int(numbers[10])
+    arena.threads = int(numbers[10])
     arena.contact = contact
     arena.total = total
     arena.island = island
@@ -176,7 +176,7 @@ def _arena_of(
 
 @wp.func
 def let_go(arena: WarpArena, first: int) -> None:
-    """Sets the accelerations of a lane's robots to their values without contacts."""
+    """Sets the accelerations of a thread's robots to their values without contacts."""
     k = wp.int32(first)
     while k >= 0:
         sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
@@ -187,32 +187,32 @@ def let_go(arena: WarpArena, first: int) -> None:
 
 
 @wp.func
-def _deal_out(arena: WarpArena, count: int, lane: int) -> int:
-    """Gives the islands to the lanes; returns the first contact of this lane, or -1.
+def _deal_out(arena: WarpArena, count: int, thread: int) -> int:
+    """Gives the islands to the threads; returns the first contact of this thread, or -1.
 
     Also sets the accelerations to their values without contacts.
     """
-    for i in range(lane, arena.free.shape[0], arena.lanes):
+    for i in range(thread, arena.free.shape[0], arena.threads):
         arena.total[i] = arena.free[i]
         arena.island[i] = i
-    if arena.lanes > 1:
-        while gaps_warp.any_votes(_join(arena, count, lane)):
+    if arena.threads > 1:
+        while gaps_warp.any_votes(_join(arena, count, thread)):
             pass
     first = wp.int32(-1)
     for j in range(count):
         k = count - 1 - j
         robot = gaps_warp.sides_of(arena.contact[1, k, arena.index])[0]
-        if arena.island[robot] % arena.lanes == lane:
+        if arena.island[robot] % arena.threads == thread:
             arena.after[k, arena.index] = first
             first = k
     return first
 
 
 @wp.func
-def _join(arena: WarpArena, count: int, lane: int) -> bool:
+def _join(arena: WarpArena, count: int, thread: int) -> bool:
     """Gives robots that touch the first of both islands; returns whether any had two."""
     moves = wp.bool(False)
-    for k in range(lane, count, arena.lanes):
+    for k in range(thread, count, arena.threads):
         sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
         if sides[1] >= 0:
             one, other = arena.island[sides[0]], arena.island[sides[1]]

@@ -1,6 +1,6 @@
 """Which robots touch each other, obstacles and walls: lists of contacts, in Warp.
 
-Several threads, called lanes, compare all pairs of an arena. For large swarms, one thread per
+Several threads compare all pairs of an arena. For large swarms, one thread per
 obstacle, wall and robot looks into the cells around it (`cells_warp`). Both list the same contacts
 in the same order.
 """
@@ -61,7 +61,7 @@ def list_by_cells(
 
 @wp.struct
 class WarpArena:
-    """Arrays of an arena, which one thread reads and writes.
+    """Arrays of an arena, which its threads read and write.
 
     Attributes:
       place: [R] x, y (m), yaw (rad).
@@ -72,15 +72,15 @@ class WarpArena:
       side: side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       numbers: radius (m), stiffness (1/s^2), damping (1/s), `solimp` (5), friction, largest number
-        of sweeps, number of lanes.
+        of sweeps, number of threads.
       contact: [N, K, A] numbers of each contact of all arenas. Row 0 is x and y of the unit vector
         along which it pushes, and two numbers of the solver; at first, the third is the gap, m. Row
         1 is two numbers of the solver, the robot pushed along the vector, and the robot pushed
         back; -1 for none. All other rows are the solver's.
       total: [R] acceleration of x, y and yaw under the current forces.
       island: [R] the first robot of each robot's island.
-      after: [K, A] the contact that a lane solves after each contact of all arenas; -1 for none.
-      lanes: number of threads of the arena.
+      after: [K, A] the contact that a thread solves after each contact of all arenas; -1 for none.
+      threads: number of threads of the arena.
       index: index of the arena.
     """
 
@@ -96,22 +96,22 @@ class WarpArena:
     total: wp.array[wp.vec3]
     island: wp.array[int]
     after: wp.array2d[int]
-    lanes: int
+    threads: int
     index: int
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    if (lanes > 1) {
-        unsigned first = threadIdx.x % 32 / lanes * lanes;
+    if (threads > 1) {
+        unsigned first = threadIdx.x % 32 / threads * threads;
         __syncwarp();
-        return (__ballot_sync(0xffffffffu, yes) >> first) & (0xffffffffu >> (32 - lanes));
+        return (__ballot_sync(0xffffffffu, yes) >> first) & (0xffffffffu >> (32 - threads));
     }
 #endif
     return yes;
 """)
-def vote(yes: bool, lanes: int) -> wp.uint32:
-    """Waits until all lanes have written their results; returns a bit for each of the arena."""
+def vote(yes: bool, threads: int) -> wp.uint32:
+    """Waits until all threads have written their results; returns a bit for each of the arena."""
     ...
 
 
@@ -124,7 +124,7 @@ def vote(yes: bool, lanes: int) -> wp.uint32:
 #endif
 """)
 def any_votes(yes: bool) -> bool:
-    """Waits as `vote` does; returns whether any lane of the warp, of any arena, says yes."""
+    """Waits as `vote` does; returns whether any thread of the warp, of any arena, says yes."""
     ...
 
 
@@ -141,21 +141,21 @@ def ones(bits: wp.uint32) -> int:
 
 
 @wp.func
-def list_contacts(arena: WarpArena, lane: int) -> int:
+def list_contacts(arena: WarpArena, thread: int) -> int:
     """Lists the contacts with obstacles, walls and other robots; returns their number."""
     robots, fixtures = arena.place.shape[0], arena.obstacle.shape[0] + _WALLS
-    gaps, before = robots * (fixtures + robots), (wp.uint32(1) << wp.uint32(lane)) - wp.uint32(1)
-    count, owner, robot = wp.int32(0), wp.int32(lane // robots), wp.int32(lane % robots)
+    gaps, before = robots * (fixtures + robots), (wp.uint32(1) << wp.uint32(thread)) - wp.uint32(1)
+    count, owner, robot = wp.int32(0), wp.int32(thread // robots), wp.int32(thread % robots)
     box = _box_of(arena, owner % (fixtures + robots), 0.0)
-    for start in range(0, gaps, arena.lanes):
+    for start in range(0, gaps, arena.threads):
         gap = wp.vec3(0.0, 0.0, 1.0)
-        if start + lane < gaps:
+        if start + thread < gaps:
             gap = _gap_to(arena, box, owner - fixtures, robot)
-        closed = vote(gap[2] < 0.0, arena.lanes)
+        closed = vote(gap[2] < 0.0, arena.threads)
         if gap[2] < 0.0:
             _list_gap(arena, count + ones(closed & before), gap, owner - fixtures, robot)
         count += ones(closed)
-        robot += arena.lanes
+        robot += arena.threads
         if robot >= robots:
             owner += robot // robots
             robot = robot % robots

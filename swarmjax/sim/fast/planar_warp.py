@@ -1,7 +1,7 @@
 """Forces between planar robots without friction, in Warp.
 
-`discs` describes the problem, `contacts_warp` the kernel. A lane sweeps through its contacts until
-no force changes.
+`discs` describes the problem, `contacts_warp` the kernel. A thread sweeps through its contacts
+until no force changes.
 """
 
 import functools
