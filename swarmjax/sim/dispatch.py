@@ -190,6 +190,18 @@ def load_paths(impl: str) -> ModuleType | None:
     return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.paths_warp")
 
 
+def load_senses(impl: str) -> ModuleType | None:
+    """Loads what looks around in Warp; returns None where plain JAX looks around.
+
+    Args:
+      impl: `jax` or `warp`.
+
+    Returns:
+      `swarmjax.sim.fast.senses_warp`, or None.
+    """
+    return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.senses_warp")
+
+
 def has_cells(robots: int, listed: int) -> bool:
     """Returns whether robots look for others in cells; else all pairs are compared.
 

@@ -107,18 +107,27 @@ def rays(pose: Array, xp: Any, mount: Mount = EPUCK) -> tuple[Array, Array]:
 def _cast(pose: Array, xp: Any, mount: Mount) -> Ray:
     """Places the rays [..., K] of robots [..., 3] in the world."""
     cos, sin = xp.cos(pose[..., 2])[..., None], xp.sin(pose[..., 2])[..., None]
-    x, y, bearing = np.array(mount.poses, np.float32).T
-    # Angle-sum identities avoid a sine and a cosine per ray for sensors with the nominal yaw.
-    ahead, aside = np.cos(bearing), np.sin(bearing)
-    if mount.turn is not None:
-        yaw = bearing + mount.turn
-        ahead, aside = xp.cos(yaw), xp.sin(yaw)
+    x, y, ahead, aside = mounted(mount, xp)
     return Ray(
         x=pose[..., :1] + cos * x - sin * y,
         y=pose[..., 1:2] + sin * x + cos * y,
         toward_x=cos * ahead - sin * aside,
         toward_y=sin * ahead + cos * aside,
     )
+
+
+def mounted(mount: Mount, xp: Any) -> Ray:
+    """Returns rays [K] or [..., K] in the frames of the robots; angle sums turn them further.
+
+    Args:
+      mount: how the sensors are mounted.
+      xp: `numpy` or `jax.numpy`.
+    """
+    x, y, bearing = np.array(mount.poses, np.float32).T
+    if mount.turn is None:
+        return Ray(x, y, np.cos(bearing), np.sin(bearing))
+    yaw = bearing + mount.turn
+    return Ray(x, y, xp.cos(yaw), xp.sin(yaw))
 
 
 def ray_walls(ray: Ray, half: Array, xp: Any) -> Array:
@@ -263,15 +272,16 @@ def sights(
 
     Returns:
       Distance [..., R, K] from the sensor's origin to the nearest surface, m, 0..limit; and the
-      reflectance [..., R, K] of that surface, 1 where there is none. At equal distances, a wall
-      takes precedence over a robot, and a robot over an obstacle. Among objects of one kind, the
+      reflectance [..., R, K] of that surface, 1 where there is none. At equal distances, the
       brightest takes precedence.
     """
     xp = pose.__array_namespace__()
     nearest, bright = xp.inf, 1.0
     for reaches, shade in _things(pose, side, obstacle, hull_radius, mount, reflectance, near, xp):
         here = least(reaches, xp.inf, xp)
-        bright = xp.where(here < nearest, _brightest(reaches, here, shade, xp), bright)
+        found = _brightest(reaches, here, shade, xp)
+        brighter = xp.where(here == nearest, xp.maximum(bright, found), bright)
+        bright = xp.where(here < nearest, found, brighter)
         nearest = xp.minimum(nearest, here)
     return xp.clip(nearest, 0.0, limit), xp.where(nearest < limit, bright, 1.0)
 

@@ -8,15 +8,14 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import chex
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.sim import dispatch, infrared, neighbours, physics
+from swarmjax.sim import dispatch, infrared, physics, senses
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
-from swarmjax.sim.neighbours import Near
+from swarmjax.sim.senses import Surround
 from swarmjax.task import electronics as task_electronics
 from swarmjax.task import (
     extended,
@@ -111,9 +110,7 @@ def reset(world: World, level: Level) -> EnvState:
     clock, arrived = jnp.zeros((), jnp.int32), jnp.zeros(robots, bool)
     goal, target = world.goal.begin(level)
     level = level._replace(target=target)
-    hull, reach = world.robot.hull_radius, world.electronics.reach
-    near = neighbours.look(level.start, hull, reach, jnp)
-    sight = _look(world, level.start, level, factors, near)
+    sight, _ = _look(world, level.start, level, factors)
     sight = _look_by_extension(world, sight, level.start, level, arrived, clock)
     memory, seen = task_electronics.begin(world.electronics, factors, sight, clock, jnp)
     return EnvState(
@@ -175,15 +172,16 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     chex.assert_shape(action, (state.level.present.shape[0], sim_drive.ACTION_SIZE))
     active = state.level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
-    data, memory, pose, near, sound = _move(world, state, action, active)
-    looked = _look(world, pose, state.level, state.factors, near)  # at the targets of before
+    data, memory, pose, sound = _move(world, state, action, active)
+    looked, around = _look(world, pose, state.level, state.factors)  # at the targets of before
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
     memory, seen = task_electronics.sense(
         world.electronics, memory, state.factors, sight, clock, jnp
     )
-    begins, apart = _count_contacts(world, state, pose, near)
+    begins, apart = sim_gaps.count_contacts(around.gap, state.apart, world.task.control_step, jnp)
+    begins &= level.present[:, None]
     after = replace(
         state,
         sim=data,
@@ -199,7 +197,9 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     earns = ends if turn.earns is None else turn.earns
     earned = _reward_step(world, state, after, looked, earns, begins, pose, action)
     gained = reward.total(earned, world.task.reward, world.terms)
-    sound &= _is_finite(gained, active) & _is_finite(sight.distance, level.present)
+    sound &= (
+        around.complete & _is_finite(gained, active) & _is_finite(sight.distance, level.present)
+    )
     sound &= _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
@@ -232,16 +232,6 @@ def _turn(
     distance, bearing = observation.to_target(pose, turn.target, jnp)
     sight = sight._replace(distance=distance, bearing=bearing)
     return turn, state.level._replace(target=turn.target), sight
-
-
-def _count_contacts(
-    world: World, state: EnvState, pose: Array, near: Near | None
-) -> tuple[Array, Array]:
-    """Returns which contacts [R, 3] begin at poses [R, 3], and the time since the last contacts."""
-    level = state.level
-    gap = sim_gaps.gaps(pose, level.side, level.obstacle, world.robot.hull_radius, jnp, near)
-    begins, apart = sim_gaps.count_contacts(gap, state.apart, world.task.control_step, jnp)
-    return begins & level.present[:, None], apart
 
 
 def _reward_step(
@@ -285,11 +275,11 @@ def _is_finite(numbers: Array, counted: Array) -> Array:
 
 def _move(
     world: World, state: EnvState, action: Array, active: Array
-) -> tuple[Any, Memory, Array, Near | None, Array]:
+) -> tuple[Any, Memory, Array, Array]:
     """Steps the physics; only active robots obey their commands.
 
     Returns:
-      Data, memory, poses, the robots near each robot, and whether the physics is sound.
+      Data, memory, poses, and whether the physics is sound.
     """
     found, level = state.factors, state.level
     command = sim_drive.command(action, world.drive, jnp)
@@ -302,27 +292,19 @@ def _move(
     sound = physics.is_finite(data)
     # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
-    pose = jnp.where(sound, after, before)
-    hull, reach = world.robot.hull_radius, world.electronics.reach
-    near = neighbours.look(pose, hull, reach, jnp)
-    return data, memory, pose, near, sound if near is None else sound & ~near.full
+    return data, memory, jnp.where(sound, after, before), sound
 
 
-def _look(world: World, pose: Array, level: Level, factors: Factors, near: Near | None) -> Sight:
-    """Computes the sensor quantities at poses [R, 3]."""
+def _look(world: World, pose: Array, level: Level, factors: Factors) -> tuple[Sight, Surround]:
+    """Looks around from poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
-    radius, reach = world.robot.hull_radius, world.electronics.reach
-    mount = infrared.Mount(world.robot.sensor_poses, factors.infrared_yaw)
-    shades = task_electronics.reflectance(factors)
-    arena = (pose, level.side, level.obstacle, radius, reach)
-    if shades is None:
-        ray, bright = infrared.distances(*arena, jnp, mount, near), None
-    else:
-        ray, bright = infrared.sights(*arena, shades, mount, near)
-    # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
-    # on a GPU.
-    ray, bright = jax.lax.optimization_barrier((ray, bright))
-    return Sight(ray, bright, distance, bearing)
+    shades = infrared.Reflectance(factors.reflectance, factors.reflectance_robot)
+    scene = senses.Scene(pose, level.side, level.obstacle, factors.infrared_yaw, shades)
+    robot, impl = world.robot, world.physics.engine.impl
+    around = senses.look(
+        scene, robot.sensor_poses, robot.hull_radius, world.electronics.reach, impl
+    )
+    return Sight(around.ray, around.bright, distance, bearing), around
 
 
 def _look_by_extension(

@@ -239,19 +239,16 @@ def test_what_has_no_reflectance_of_its_own_is_as_bright_as_can_be(xp: ModuleTyp
 
 
 @MODULES
-def test_of_two_things_that_hold_a_sensor_the_wall_counts_then_the_brightest(
-    xp: ModuleType,
-) -> None:
+def test_of_several_things_that_hold_a_sensor_the_brightest_counts(xp: ModuleType) -> None:
     # In the first pose sensors 0 and 7 are inside both boxes. In the second pose both sensors are
     # inside the second box and 2 mm inside the wall.
     box = xp.array(_f32([0.47, 0.0, 0.0, 0.03, 0.03], [0.48, 0.0, 0.0, 0.03, 0.03]))
-    for x, shade in ((0.45, 0.7), (0.472, 0.9)):
+    for x, wall, brightest in ((0.45, 0.9, 0.7), (0.472, 0.9, 0.9), (0.472, 0.65, 0.7)):
         pose = xp.array(_f32([x, 0.0, 0.0], [5.0, 0.0, 0.0], [5.5, 0.0, 0.0]))
-        distance, bright = infrared.sights(
-            pose, _f32(1.0)[0], box, RADIUS, RANGE, _reflectance(xp, **SHADES), Mount()
-        )
+        shades = _reflectance(xp, fixture=(wall, 0.6, 0.7), robot=SHADES["robot"])
+        distance, bright = infrared.sights(pose, _f32(1.0)[0], box, RADIUS, RANGE, shades, Mount())
         np.testing.assert_array_equal(np.asarray(distance)[0, [0, 7]], 0.0)
-        np.testing.assert_allclose(np.asarray(bright)[0, [0, 7]], shade, atol=ROUNDING)
+        np.testing.assert_allclose(np.asarray(bright)[0, [0, 7]], brightest, atol=ROUNDING)
 
 
 def _no_box(xp: ModuleType) -> Any:
