@@ -22,8 +22,11 @@ from swarmjax import provenance
 from swarmjax.config import to_dict
 from swarmjax.outputs import replacing
 from swarmjax.run.settings import TrainConfig
+from swarmjax.sim.fast import arenas_warp
 from swarmjax.training.rollout import Program
 
+# A trace is only used by the versions that made it, so its calls need not be stable.
+_ANY_CALL = [export.DisabledSafetyCheck.custom_call("ALL")]
 # Settings on which no trace depends. The seed is an argument of `mesh.init`.
 _NOT_TRACED = ("run", "resume", "init_from", "seed")
 
@@ -51,23 +54,29 @@ def keep(
     if not folder or not jax.config.jax_enable_compilation_cache or not _can_keep(program):
         return jitted
     shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
-    key = hashlib.sha256(f"{_digest(program)} {shapes}".encode()).hexdigest()
-    path = Path(folder) / f"{name}-{key}.trace"
+    before = list(arenas_warp.CALLS)  # they number the calls of the next trace
+    key = hashlib.sha256(f"{_digest(program)} {shapes}".encode() + pickle.dumps(before))
+    path = Path(folder) / f"{name}-{key.hexdigest()}.trace"
     try:
-        traced = pickle.loads(zlib.decompress(path.read_bytes()))
+        traced, calls = pickle.loads(zlib.decompress(path.read_bytes()))
     except Exception:  # missing, or damaged in any way
-        traced = replace(export.export(jitted)(*given), _get_vjp=None)  # a closure
+        trace = export.export(jitted, disabled_checks=_ANY_CALL)
+        traced = replace(trace(*given), _get_vjp=None)  # a closure
+        calls = arenas_warp.CALLS[len(before) :]
         with contextlib.suppress(OSError), replacing(path) as file:
-            file.write_bytes(zlib.compress(pickle.dumps(traced)))
+            file.write_bytes(zlib.compress(pickle.dumps((traced, calls))))
+    else:
+        arenas_warp.repeat(calls)
     return jax.jit(traced.call, donate_argnums=donated)
 
 
 def _can_keep(program: Program[TrainConfig]) -> bool:
     """Returns whether the key covers the whole trace, and the trace is all that a call needs."""
-    config = program.config
-    # Tracing also registers Warp's kernels and Triton's, and an extension may import any file.
-    on_cpu = jax.default_backend() == "cpu" and program.world.physics.engine.impl == "jax"
-    return on_cpu and config.devices == 1 and config.extensions is None
+    config, engine = program.config, program.world.physics.engine
+    # Tracing also registers the kernels of Warp, of which only those for planar robots can be
+    # registered again. An extension may import any file.
+    again = engine.impl == "jax" or (engine.solver, config.robot.body) == ("swarm", "planar")
+    return again and config.devices == 1 and config.extensions is None
 
 
 @functools.lru_cache(1)  # a world that was traced fills its caches, which changes its bytes

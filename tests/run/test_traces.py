@@ -1,6 +1,9 @@
 """Checks that traces are kept, and used again only if nothing that they depend on changed."""
 
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -108,3 +111,41 @@ def test_no_trace_depends_on_the_seed(tiny_config: TrainConfig) -> None:
         chunk = mesh.jit_chunk(program).trace(schedule, init.eval_shape(*given), np.int32(1))
         texts.add(f"{init.trace(*given).jaxpr} {chunk.jaxpr}")
     assert len(texts) == 1
+
+
+# Two calls of one kernel, and a factor. A second process has the factor of the kept trace.
+_WITH_WARP = """
+import sys
+import jax, numpy as np
+from swarmjax import epuck
+from swarmjax.run import traces
+from swarmjax.run.load_settings import load_train
+from swarmjax.sim import senses
+from swarmjax.training import program as programs
+
+program = programs.load(load_train(["stage=s1", "sim.impl=warp", "arenas=8", "budget=1e4"]))[0]
+pose = np.array([[0.0, 0.0, 0.0], [0.08, 0.0, 1.0]], np.float32)
+factor = float(sys.argv[1])
+
+def look(pose):
+    scene = senses.Scene(pose, np.float32(1.0), np.zeros((0, 5), np.float32))
+    rays = [
+        senses.look(scene, epuck.SENSOR_POSES, 0.037, reach, "warp").ray for reach in (0.04, 0.06)
+    ]
+    return factor * rays[0], rays[1]
+
+found = traces.keep(program, "look", jax.jit(look), (pose,))(pose)
+print([ray.tolist() for ray in found])
+"""
+
+
+def test_a_kept_trace_calls_warp_in_the_next_process(folder: Path) -> None:
+    def run(factor: str) -> str:
+        words = [sys.executable, "-c", _WITH_WARP, factor]
+        made = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder)}
+        return subprocess.run(words, env=made, check=True, capture_output=True, text=True).stdout
+
+    first = run("2.0")
+    assert "0.0799999" in first  # m; twice the limit of 0.04 m, because that ray meets nothing
+    assert len(list(folder.glob("look-*.trace"))) == 1
+    assert run("3.0") == first

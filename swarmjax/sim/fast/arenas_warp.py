@@ -1,11 +1,18 @@
 """Makes kernels in Warp, which compute many arenas, work under `vmap`."""
 
+import threading
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import custom_vmap
+
+# Warp loads a module when JAX first traces one of its kernels. Only one thread at a time may do so.
+_LOADING = threading.Lock()
+# All calls of this process, in order: the function and the shapes of its inputs.
+CALLS: list[tuple[Any, tuple]] = []
 
 
 def over_arenas(solve: Any, *inputs: Any) -> Array:
@@ -18,7 +25,7 @@ def over_arenas(solve: Any, *inputs: Any) -> Array:
     Returns:
       The result for the arena.
     """
-    many = custom_vmap(solve)
+    many = custom_vmap(partial(_call, solve))
 
     @many.def_vmap
     def _(size: int, batched: Any, *given: Any) -> tuple[Array, bool]:
@@ -32,3 +39,18 @@ def over_arenas(solve: Any, *inputs: Any) -> Array:
         return result.reshape(*shape, *result.shape[1:]), True
 
     return many(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))[0]
+
+
+def _call(solve: Any, *given: Any) -> Array:
+    with _LOADING:
+        CALLS.append((solve, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), given)))
+        return solve(*given)
+
+
+def repeat(calls: list[tuple[Any, tuple]]) -> None:
+    """Tells Warp of calls in a program that is not traced now, but was after the same `CALLS`.
+
+    A traced program names each of its calls by a number, which Warp counts.
+    """
+    for solve, shapes in calls:
+        jax.eval_shape(partial(_call, solve), *shapes)

@@ -19,6 +19,7 @@ JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA 
 # pyright: reportCallIssue=false
 
 import functools
+import importlib
 from typing import Any
 
 import jax
@@ -41,16 +42,14 @@ _THREADS = 2**17  # threads of all arenas, beyond which more threads an arena do
 _MOST_THREADS = 32
 
 
-def launch(
-    kernels: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
-) -> Array:
+def launch(solver: str, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """Computes the accelerations of one arena's robots, including contacts.
 
     `vmap` adds arenas to the same kernel, for any axes.
 
     Args:
-      kernels: result of `kernels_of`.
-      rows: rows of `WarpArena.contact` that its solver uses.
+      solver: name of a module with `KERNELS`, the result of `kernels_of`, and `ROWS`, the rows of
+        `WarpArena.contact` that they use.
       discs: constants.
       robots: their state, and their accelerations without contacts.
       side: [] side of the arena, m.
@@ -59,12 +58,10 @@ def launch(
     Returns:
       [R, 3] accelerations of x and y, m/s^2, and of yaw, rad/s^2.
     """
-    return over_arenas(functools.partial(_launch, kernels, rows, discs), robots, side, obstacle)
+    return over_arenas(functools.partial(_launch, solver, discs), robots, side, obstacle)
 
 
-def _launch(
-    kernels: Any, rows: int, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array
-) -> Array:
+def _launch(solver: str, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """Computes the accelerations [A, R, 3] of many arenas."""
     arenas, count = robots.mobility.shape
     fixtures = obstacle.shape[1] + sim_model.WALLS
@@ -75,13 +72,14 @@ def _launch(
     numbers = jnp.asarray(np.array([*hull, discs.sweeps, threads], np.float32))
     body = jnp.stack([robots.mobility, robots.weight, robots.agility], axis=-1)
     motion = robots.place, robots.rate, robots.free, robots.before, body
-    motion, (few, many) = jnp.stack(motion, axis=1), kernels
+    made = importlib.import_module(solver)
+    motion, (few, many) = jnp.stack(motion, axis=1), made.KERNELS
     call = functools.partial(wp.jax_kernel, num_outputs=4, block_dim=_BLOCK)
     shapes = {"total": (arenas, count), "island": (arenas, count), "after": (contacts, arenas)}
-    room, dims = (rows, contacts, arenas), {"launch_dims": (arenas, threads)}
+    room, dims = (made.ROWS, contacts, arenas), {"launch_dims": (arenas, threads)}
     if count <= MANY:
-        given, made = (motion, side, obstacle, numbers), shapes | {"contact": room}
-        return call(few)(*given, output_dims=made, **dims)[1]
+        given, shapes = (motion, side, obstacle, numbers), shapes | {"contact": room}
+        return call(few)(*given, output_dims=shapes, **dims)[1]
     listed, contact = gaps_warp.list_by_cells(
         room, discs.radius, robots.place, side, obstacle, numbers
     )

@@ -8,7 +8,6 @@ minutes to compile the JAX code.
 """
 
 from functools import partial
-from typing import Any
 
 import jax.numpy as jnp
 import warp as wp
@@ -36,7 +35,7 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
       arena. The distance from a corner to itself is 0 m, unless the corner lies outside.
     """
     size = len(corner), len(corner)
-    return _run(_leg, size, {"length": size}, widened, corner, side, frame)
+    return _run("_leg", size, {"length": size}, widened, corner, side, frame)
 
 
 def settle(target: Array, corner: Array, frame: Array, legs: Array, widened: float) -> Array:
@@ -54,7 +53,7 @@ def settle(target: Array, corner: Array, frame: Array, legs: Array, widened: flo
     """
     size = len(target), len(corner)
     shapes = {"state": size, "to_go": size}
-    return _run(_settle_corners, size[:1], shapes, widened, target, corner, frame, legs)
+    return _run("_settle_corners", size[:1], shapes, widened, target, corner, frame, legs)
 
 
 def measure(
@@ -74,18 +73,18 @@ def measure(
       [R] m; inf without a path.
     """
     size = (len(place),)
-    return _run(_path, size, {"length": size}, widened, place, target, corner, to_go, frame)
+    return _run("_path", size, {"length": size}, widened, place, target, corner, to_go, frame)
 
 
-def _run(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
+def _run(kernel: str, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
     """Runs a kernel for one arena; returns its last output."""
     return over_arenas(partial(_launch, kernel, threads, shapes, widened), *inputs)
 
 
-def _launch(kernel: Any, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
+def _launch(kernel: str, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
     """Runs a kernel for many arenas, with these threads and shapes of outputs for each."""
     arenas = len(inputs[0])
-    call = wp.jax_kernel(kernel, num_outputs=len(shapes))
+    call = wp.jax_kernel(globals()[kernel], num_outputs=len(shapes))
     sizes = {name: (arenas, *shape) for name, shape in shapes.items()}
     outputs = call(*inputs, widened, launch_dims=(arenas, *threads), output_dims=sizes)
     return jnp.where(outputs[-1] >= 0.5 * _FAR, jnp.inf, outputs[-1])

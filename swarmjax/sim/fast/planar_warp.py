@@ -96,4 +96,5 @@ def _sweep(arena: WarpArena, first: int) -> bool:
     return change > _TOLERANCE * largest
 
 
-push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernels_of(_solve), 2)
+KERNELS, ROWS = contacts_warp.kernels_of(_solve), 2
+push_apart = functools.partial(contacts_warp.launch, __name__)

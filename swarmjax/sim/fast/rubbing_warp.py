@@ -252,4 +252,5 @@ def _leap(arena: WarpArena, first: int, index: int, weights: wp.vec2) -> None:
         k = arena.after[k, arena.index]
 
 
-push_apart = functools.partial(contacts_warp.launch, contacts_warp.kernels_of(_solve), _PAST + KEPT)
+KERNELS, ROWS = contacts_warp.kernels_of(_solve), _PAST + KEPT
+push_apart = functools.partial(contacts_warp.launch, __name__)
