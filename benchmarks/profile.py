@@ -141,7 +141,7 @@ def profile(settings: TrainConfig, top: int) -> Iterator[lines.Line]:
     prepared = steps_per_second.prepare(settings)
     schedule, keys, rollout = prepared.schedule, prepared.keys, settings.algo.rollout_length
     given = {"arenas": settings.arenas, "robot": settings.robot.body}
-    steps = steps_per_second.control_steps(settings)
+    steps = steps_per_second.CONTROL_STEPS[settings.robot.body]
     for name, program, argument, count in (
         ("physics", prepared.physics, keys, steps),
         ("environment", prepared.environment, (schedule, keys), steps),

@@ -44,9 +44,6 @@ from swarmjax.training.rollout import Program
 
 # Control steps per call of physics and environment: whole rollouts of the default algorithm.
 CONTROL_STEPS = {"planar": 64, "wheeled": 32}
-# A GPU takes 2 ms to start a call, as long as 20 control steps of few arenas. A call of planar
-# robots has at least this many control steps of all arenas together.
-ARENA_STEPS = 2**22
 TRAIN_SECONDS = 1.0  # s; approximate time of a call of training
 THREADS = 4  # sizes compiled in parallel
 # Every line has these entries. The lines of peers have entries with the same names.
@@ -116,7 +113,8 @@ def physics_alone(program: Program, arenas: EnvState, key: Array) -> tuple[EnvSt
         wheels = drive.wheel_speeds(command, world.drive, jnp)
         return move(data, level.side, level.obstacle, wheels), None
 
-    data, _ = jax.lax.scan(body, data, jax.random.split(key, control_steps(program.config)))
+    steps = CONTROL_STEPS[program.config.robot.body]
+    data, _ = jax.lax.scan(body, data, jax.random.split(key, steps))
     return arenas, jnp.sum(jax.vmap(physics.pack)(data).qpos)
 
 
@@ -156,15 +154,7 @@ def environment(
 
 def _rollouts(settings: TrainConfig) -> int:
     """Returns the number of rollouts per call of the environment."""
-    return max(1, control_steps(settings) // settings.algo.rollout_length)
-
-
-def control_steps(settings: TrainConfig) -> int:
-    """Returns the number of control steps per call of the physics."""
-    body = settings.robot.body
-    if body != "planar" or jax.default_backend() != "gpu":
-        return CONTROL_STEPS[body]
-    return max(CONTROL_STEPS[body], ARENA_STEPS // settings.arenas)
+    return max(1, CONTROL_STEPS[settings.robot.body] // settings.algo.rollout_length)
 
 
 def _actions(program: Program, key: Array) -> Array:
@@ -246,7 +236,7 @@ def settle(prepared: Prepared) -> rollout.Arena:
 def time_physics(prepared: Prepared, arenas: EnvState) -> dict[str, Any]:
     """Times the physics alone; returns the JSON line. The arenas' buffers are donated."""
     calls_s, _ = timing.time_program(prepared.physics, arenas, prepared.keys)
-    steps = control_steps(prepared.program.config)
+    steps = CONTROL_STEPS[prepared.program.config.robot.body]
     return _line(prepared, "physics", steps, calls_s)
 
 
