@@ -19,8 +19,10 @@ Examples:
   python -m swarmjax.train resume=runs/first
 """
 
+import contextlib
 import gc
 import sys
+import threading
 from collections.abc import Sequence
 
 from swarmjax.exit_codes import FAILED, INTERRUPTED, REQUEUE, USER_ERROR
@@ -34,6 +36,8 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.load_settings import load_run
 
         settings = load_run(arguments)
+        if not settings.run.distributed:  # whose processes first have to find each other
+            threading.Thread(target=_open_device).start()
         from swarmjax.run.display import Display
         from swarmjax.run.run import Run
 
@@ -42,6 +46,19 @@ def main(arguments: Sequence[str]) -> int:
         except Exception as error:
             return _failed(error, stop)
         return stop.code or 0
+
+
+def _open_device() -> None:
+    """Opens a GPU for JAX and Warp, which takes 2 s, while the main thread imports its modules."""
+    with contextlib.suppress(Exception):  # the run meets the same error, and reports it
+        import jax
+        import numpy as np
+
+        jax.block_until_ready(jax.device_put(np.zeros(1)))
+        if jax.default_backend() == "gpu":
+            from swarmjax.sim import engine
+
+            engine.start_warp()
 
 
 def _failed(error: Exception, stop: Stop) -> int:

@@ -22,7 +22,7 @@ from swarmjax import provenance
 from swarmjax.config import to_dict
 from swarmjax.outputs import replacing
 from swarmjax.run.settings import TrainConfig
-from swarmjax.sim.fast import arenas_warp
+from swarmjax.sim import dispatch
 from swarmjax.training.rollout import Program
 
 # A trace is only used by the versions that made it, so its calls need not be stable.
@@ -54,7 +54,8 @@ def keep(
     if not folder or not jax.config.jax_enable_compilation_cache or not _can_keep(program):
         return jitted
     shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
-    before = list(arenas_warp.CALLS)  # they number the calls of the next trace
+    fast = dispatch.load_fast("arenas_warp", program.world.physics.engine.impl)
+    before = [] if fast is None else list(fast.CALLS)  # they number the calls of the next trace
     key = hashlib.sha256(f"{_digest(program)} {shapes}".encode() + pickle.dumps(before))
     path = Path(folder) / f"{name}-{key.hexdigest()}.trace"
     try:
@@ -62,11 +63,12 @@ def keep(
     except Exception:  # missing, or damaged in any way
         trace = export.export(jitted, disabled_checks=_ANY_CALL)
         traced = replace(trace(*given), _get_vjp=None)  # a closure
-        calls = arenas_warp.CALLS[len(before) :]
+        calls = [] if fast is None else fast.CALLS[len(before) :]
         with contextlib.suppress(OSError), replacing(path) as file:
             file.write_bytes(zlib.compress(pickle.dumps((traced, calls))))
     else:
-        arenas_warp.repeat(calls)
+        if fast is not None:
+            fast.repeat(calls)
     return jax.jit(traced.call, donate_argnums=donated)
 
 

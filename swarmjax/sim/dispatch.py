@@ -157,7 +157,7 @@ def load_engine(
 
     robots = len(ids.hull_body)
     if choice.impl == "warp":
-        engine.quiet_warp()
+        engine.start_warp()
     if choice.solver == "mjx":
         return engine.load_mjx(model, robots, choice.impl, arenas)
     if robot.body == "planar":
@@ -178,28 +178,17 @@ def _push_apart(impl: str, *, rubs: bool) -> Any:
     return importlib.import_module(f"swarmjax.sim.fast.{name}").push_apart
 
 
-def load_paths(impl: str) -> ModuleType | None:
-    """Loads the shortest-path finder in Warp; returns None where plain JAX finds the paths.
+def load_fast(name: str, impl: str) -> ModuleType | None:
+    """Loads a module of Warp kernels; returns None where plain JAX is used instead.
 
     Args:
+      name: `arenas_warp`, `paths_warp` or `senses_warp`.
       impl: `jax` or `warp`.
 
     Returns:
-      `swarmjax.sim.fast.paths_warp`, or None.
+      The module of `swarmjax.sim.fast`, or None.
     """
-    return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.paths_warp")
-
-
-def load_senses(impl: str) -> ModuleType | None:
-    """Loads what looks around in Warp; returns None where plain JAX looks around.
-
-    Args:
-      impl: `jax` or `warp`.
-
-    Returns:
-      `swarmjax.sim.fast.senses_warp`, or None.
-    """
-    return None if impl != "warp" else importlib.import_module("swarmjax.sim.fast.senses_warp")
+    return None if impl != "warp" else importlib.import_module(f"swarmjax.sim.fast.{name}")
 
 
 def has_cells(robots: int, listed: int) -> bool:

@@ -87,11 +87,12 @@ def import_mjx() -> Any:
     return mjx
 
 
-def quiet_warp() -> None:
-    """Stops Warp from printing its banner and the name of every kernel it loads."""
+def start_warp() -> None:
+    """Starts Warp without its banner and without the name of every kernel that it loads."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR
+    warp.init()
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:

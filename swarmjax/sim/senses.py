@@ -59,7 +59,7 @@ def look(scene: Scene, poses: Any, hull_radius: float, limit: float, impl: str =
       What surrounds each robot.
     """
     shines = any(part is not None for part in scene.shades)
-    fast = dispatch.load_senses(impl)
+    fast = dispatch.load_fast("senses_warp", impl)
     if fast is not None:
         found = fast.look(scene, poses, hull_radius, limit)
         ray, bright = (jnp.swapaxes(found[: len(poses), :, i], 0, 1) for i in range(2))

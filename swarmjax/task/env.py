@@ -140,7 +140,8 @@ def _measure_path(
     """Measures the shortest paths from the starts or from poses [R, 3], if the reward uses them."""
     if not world.task.reward.path_progress:
         return None
-    hull, fast = world.robot.hull_radius, dispatch.load_paths(world.physics.engine.impl)
+    hull, impl = world.robot.hull_radius, world.physics.engine.impl
+    fast = dispatch.load_fast("paths_warp", impl)
     if before is None or pose is None:
         return geodesic.begin(level, hull, fast)
     return geodesic.go_on(before, pose[:, :2], level, hull, fast)

@@ -16,7 +16,7 @@ from swarmjax.sim.fast.discs import DiscRobots, Discs
 from swarmjax.sim.fast.gaps_warp import WarpArena
 from swarmjax.task import level
 
-engine.quiet_warp()
+engine.start_warp()
 RADIUS, ROOM = np.float32(0.037), 2000  # m, contacts of an arena
 CELL = gaps_warp.CELL * RADIUS
 NUMBERS = jnp.asarray(np.array([RADIUS, *np.ones(10)], np.float32))

@@ -21,7 +21,7 @@ ROUNDING = 1e-5
 
 @pytest.fixture(autouse=True)
 def _quiet() -> None:
-    engine.quiet_warp()
+    engine.start_warp()
 
 
 def _look(robots: int, impl: str, *, drawn: bool, jammed: bool) -> Surround:
