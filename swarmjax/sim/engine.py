@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 from jax import Array
 
-# Warp stores the contacts of all arenas together. It gets memory for this average number of hull
-# contacts per robot, which is far more than a swarm makes. Floor contacts are counted separately.
-CONTACTS_PER_ROBOT = 3
+# Warp stores the pairs of geoms that may touch, those of all arenas together. It compares spheres
+# around geoms, and the spheres around walls hold all robots. So it gets memory for all walls and
+# boxes of each robot, and for this average number of other robots, far more than a swarm meets.
+OTHERS_PER_ROBOT = 3
 # Most contacts per robot in one arena. A disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
 FEW_ARENAS = 64  # up to this number, all arenas may be crowded, so every pair gets memory
@@ -99,8 +100,10 @@ def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
     """Returns sizes of Warp's memory: contacts of all arenas, and solver rows of each arena."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = _rows(model)
+    of_world = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any(axis=0)
     pairs, floor = int(np.sum(~on_floor)), int(np.sum(on_floor))
-    hulls = max(arenas * CONTACTS_PER_ROBOT * robots, min(arenas, FEW_ARENAS) * pairs)
+    met = min(pairs, int(np.sum(of_world & ~on_floor)) + OTHERS_PER_ROBOT * robots)
+    hulls = max(arenas * met, min(arenas, FEW_ARENAS) * pairs)
     return {
         "naconmax": hulls + arenas * floor,
         "njmax": min(pairs, ROWS_PER_ROBOT * robots) * int(np.max(rows[~on_floor], initial=1))

@@ -36,9 +36,12 @@ from engines import (
 )
 
 from swarmjax import epuck
+from swarmjax.run.load_settings import load_train
 from swarmjax.sim import drive, gaps, model, physics, wheeled
+from swarmjax.sim import engine as sim_engine
 from swarmjax.sim.body import Chassis
 from swarmjax.sim.config import RobotConfig, SimConfig
+from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
 SIDE = 0.6  # m
@@ -437,18 +440,36 @@ def test_a_step_reads_nothing_but_what_is_packed(engine: Engine) -> None:
             np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize(("arenas", "room"), [(1, 50), (64, 64 * 50), (1000, 1000 * 15)])
+@pytest.mark.parametrize(("arenas", "room"), [(1, 350), (64, 64 * 350), (1000, 1000 * 220)])
 def test_few_arenas_have_room_for_every_pair(arenas: int, room: int) -> None:
-    """Checks the room for contacts of 5 robots, 4 boxes and 4 walls.
+    """Checks the room for contacts of 20 robots, 4 boxes and 4 walls.
 
-    With few arenas there is room for all 10 pairs of robots and all 5 x 8 other pairs. With many
-    arenas there is room for 3 contacts per robot.
+    With few arenas there is room for all 190 pairs of robots and all 20 x 8 other pairs. With many
+    arenas there is room for 3 other robots per robot, and for all walls and boxes.
     """
     given = settings("warp", "planar")
-    sim = dataclasses.replace(given.sim, solver="mjx", max_robots=5, max_obstacles=4)
+    sim = dataclasses.replace(given.sim, solver="mjx", max_robots=20, max_obstacles=4)
     minibatches = dataclasses.replace(given.algo, num_minibatches=1)
     many = dataclasses.replace(given, sim=sim, algo=minibatches, arenas=arenas, budget=10**6)
     assert programs.load_world(many).physics.engine.template._impl.naconmax == room
+
+
+@pytest.mark.slow
+def test_no_pair_that_may_touch_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counts the pairs of 20 wheeled robots, 12 boxes and 4 walls that Warp looks at closely."""
+    monkeypatch.setattr(sim_engine, "FEW_ARENAS", 1)
+    words = ["stage.robots=20", "stage.side=2.4", "stage.obstacles=12", "arenas=8", "budget=1e4"]
+    config = load_train(["stage=world_plots", "robot=wheeled", "sim.impl=warp", *words])
+    program, schedule = programs.load(config)
+    begin = jax.jit(mesh.init(program))(schedule, mesh.lanes(config)).arenas
+    arenas = jax.tree.map(lambda leaf: leaf[0], begin)  # of the only seed
+    loaded, level = program.world.physics, arenas.level
+    data = jax.vmap(functools.partial(physics.unpack, loaded))(arenas.sim)
+    step = jax.vmap(functools.partial(physics.step, loaded))
+    data = jax.jit(step)(data, level.side, level.obstacle, jnp.full((8, 20, 2), 3.0))
+    found = int(np.max(data._impl.ncollision))
+    # 60 pairs with the floor and 3 for each robot, which there was room for once, are too few.
+    assert 8 * 120 < found <= data._impl.naconmax
 
 
 def test_substeps_make_up_one_control_step() -> None:
