@@ -190,8 +190,8 @@ def test_pickles_are_not_opened(tmp_path: Path, tiny: Suite) -> None:
 
 def test_the_suites_are_those_of_the_manual() -> None:
     assert set(NAMES) == {
-        "adversarial", "dense", "dev", "expanded", "final", "headline", "noise", "scaling", "stages",
-        "swarm", "worlds", "worlds_dev", "worlds_far",
+        "adversarial", "dense", "dev", "expanded", "final", "headline", "noise", "scaling",
+        "stages", "swarm", "worlds", "worlds_dev", "worlds_far",
     }  # fmt: skip
 
 

@@ -24,14 +24,14 @@ def _quiet() -> None:
     engine.start_warp()
 
 
-def _look(robots: int, impl: str, *, drawn: bool, jammed: bool) -> Surround:
+def _look(robots: int, impl: str, *, drawn: bool, jammed: bool, arenas: int = ARENAS) -> Surround:
     """Looks around in random scenes, with drawn sensors and reflectances or without."""
-    scenes = zip(*(_scene(seed, robots, jammed=jammed) for seed in range(ARENAS)), strict=True)
+    scenes = zip(*(_scene(seed, robots, jammed=jammed) for seed in range(arenas)), strict=True)
     scene = Scene(*(jnp.asarray(np.stack(part)) for part in scenes))
     if drawn:
         draw, boxes = np.random.default_rng(1), scene.obstacle.shape[1]
-        shades = (jnp.float32(draw.uniform(0.2, 1.0, (ARENAS, n))) for n in (1 + boxes, robots))
-        turn = jnp.float32(draw.normal(scale=0.1, size=(ARENAS, robots, 8)))
+        shades = (jnp.float32(draw.uniform(0.2, 1.0, (arenas, n))) for n in (1 + boxes, robots))
+        turn = jnp.float32(draw.normal(scale=0.1, size=(arenas, robots, 8)))
         scene = scene._replace(turn=turn, shades=Reflectance(*shades))
     look = jax.vmap(lambda each: senses.look(each, epuck.SENSOR_POSES, RADIUS, RANGE, impl))
     return jax.jit(look)(scene)
@@ -53,12 +53,14 @@ def test_warp_finds_what_plain_jax_finds(robots: int, drawn: bool, jammed: bool)
         np.testing.assert_allclose(bright, brightness, rtol=0, atol=ROUNDING)
 
 
-def test_cells_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("jammed", [False, True])
+@pytest.mark.parametrize("arenas", [ARENAS, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_cells_change_no_bit(arenas: int, jammed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     def everything() -> list[Any]:
-        return jax.tree.leaves(_look(60, "warp", drawn=True, jammed=True))
+        return jax.tree.leaves(_look(30, "warp", drawn=True, jammed=jammed, arenas=arenas))
 
     expected = everything()
-    monkeypatch.setattr(dispatch, "MOST_COMPARED", 59)
+    monkeypatch.setattr(dispatch, "MOST_COMPARED", 29)
     for one, other in zip(everything(), expected, strict=True):
         np.testing.assert_array_equal(one, other)
 
