@@ -3,16 +3,14 @@
 `python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]` takes the
 keys of `swarmjax.train` and prints a JSON line for each seed. Both trainers use the same compiled
 environment, with the same networks, batch, minibatches, epochs, discount, clip range, costs and
-gradient clipping. They also initialise weights in the same way, except in the critic's last layer.
+gradient clipping. They also initialise weights in the same way.
 The policies of both are judged with their mean actions on the same levels, at `points` points
 evenly spaced over the budget.
 
 Brax differs in these points:
 
-- one constant learning rate for actor and critic (`learning_rate`, by default our actor's);
+- one constant learning rate for actor and critic, our actor's;
 - Adam's epsilon;
-- a critic whose last layer starts with weights as large as those of the other layers, since Brax
-  has one initialisation for all of them;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
 - no compiler options for XLA (`program.compiler_options`);
@@ -95,9 +93,6 @@ class RaceConfig(Section):
     settings: Literal["ours", "playground"] = field(
         default="ours", metadata=about("settings of Brax: ours, or those of MuJoCo Playground")
     )
-    learning_rate: float | None = field(
-        default=None, metadata=about("Brax's rate; null: from settings", above=0.0, high=1.0)
-    )
 
 
 class Course(NamedTuple):
@@ -177,7 +172,7 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
     """Returns the arguments of Brax's `ppo.train`.
 
     Args:
-      race: settings of the race: number of points, kind of Brax's settings, and learning rate.
+      race: settings of the race: number of points, and kind of Brax's settings.
       trained: our config, with bootstrapped advantages and clipped gradients.
 
     Returns:
@@ -185,8 +180,6 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
     """
     robots = trained.arenas * trained.sim.robots
     given = {"ours": _our_settings(trained), "playground": PLAYGROUND}[race.settings]
-    if race.learning_rate is not None:
-        given = given | {"learning_rate": race.learning_rate}
     updates = _evenly(race, _brax_updates(trained, given))
     return given | {
         "num_timesteps": int(updates[-1]) * robots * given["unroll_length"],
@@ -235,11 +228,16 @@ def network_factory(trained: TrainConfig) -> Callable[..., Any]:
         init_noise_std=algo.initial_std,
         policy_network_kernel_init_fn=orthogonal,
         policy_network_kernel_init_kwargs={"scale": math.sqrt(2.0)},
-        value_network_kernel_init_fn=orthogonal,
-        value_network_kernel_init_kwargs={"scale": math.sqrt(2.0)},
+        value_network_kernel_init_fn=lambda: _critic_kernel,
         mean_kernel_init_fn=orthogonal,
         mean_kernel_init_kwargs={"scale": 0.01},
     )
+
+
+def _critic_kernel(key: jax.Array, shape: Any, dtype: Any = None) -> jax.Array:
+    """Initialises a layer of Brax's critic as ours; its last layer is the one with one output."""
+    gain = 0.01 if shape[-1] == 1 else math.sqrt(2.0)
+    return jax.nn.initializers.orthogonal(gain)(key, shape, dtype)
 
 
 def as_learners(trained: TrainConfig, params: Any) -> LearnerState:

@@ -1,7 +1,9 @@
-"""Checks that README quotes only measurements that are stored."""
+"""Checks that pages quote measurements that are stored, of the stated size, and not too old."""
 
+import importlib.util
 import json
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +17,36 @@ _QUOTED = yaml.safe_load((Path(__file__).parent / "quoted_figures.yaml").read_te
 _MEASURED = re.compile(
     r"\d[\d.,]* ?(?:%|[MkG]\b)|\d[\d.,]* (?:contacts|seconds|times faster)|\| *\d[\d.,]* *(?=\|)"
 )
+# A figure may be older than the newest change of the code that it speaks of, by this many days.
+_MOST_DAYS = 14
+_CODE = [f"swarmjax/{room}" for room in ("sim", "task", "ppo", "curriculum", "training")]
+
+
+def _load_tables() -> Any:
+    path = _ROOT / "docs" / "_ext" / "readme_tables.py"
+    spec = importlib.util.spec_from_file_location("readme_tables", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+_MAKER = _load_tables()
+_TABLES = [table.strip() for table in _MAKER.tables(_MAKER.read())]
+
+
+def _line(value: str) -> dict[str, Any]:
+    """Reads the line that `value` names by file and number."""
+    file, _, line = value.split()[0].partition(":")
+    lines = (_ROOT / "benchmarks" / "results" / file).read_text().splitlines()
+    return json.loads(lines[int(line) - 1])
 
 
 def _number(value: str) -> float:
     """Reads the number that `value` names by file, line and keys."""
-    place, keys, *factor = value.split()
-    file, _, line = place.partition(":")
-    lines = (_ROOT / "benchmarks" / "results" / file).read_text().splitlines()
-    found: Any = json.loads(lines[int(line) - 1])
+    _, keys, *factor = value.split()
+    found: Any = _line(value)
     for key in _keys(keys):
         found = found[int(key)] if isinstance(found, list) else found[key]
     return found * float(factor[0] if factor else 1)
@@ -37,15 +61,55 @@ def _rendered(entry: dict[str, Any]) -> str:
     return entry["text"].format(*map(_number, entry["values"]))
 
 
-@pytest.mark.parametrize("entry", _QUOTED, ids=lambda entry: entry["text"][:40])
+def _git(*words: str) -> str:
+    found = subprocess.run(["git", *words], cwd=_ROOT, capture_output=True, text=True, check=False)
+    return found.stdout.strip()
+
+
+def _days_behind(commit: str) -> float:
+    """Returns how much older a commit is than the newest change of `_CODE`."""
+    measured = _git("show", "-s", "--format=%ct", commit)
+    assert measured, f"commit {commit} is not in the history"
+    return (int(_git("log", "-1", "--format=%ct", "--", *_CODE)) - int(measured)) / 86400.0
+
+
+_by_text = pytest.mark.parametrize("entry", _QUOTED, ids=lambda entry: entry["text"][:40])
+
+
+@_by_text
 def test_a_quoted_figure_is_that_of_its_line(entry: dict[str, Any]) -> None:
-    assert _rendered(entry) in _README
+    page = entry.get("page", "README.md")
+    assert _rendered(entry) in (_ROOT / page).read_text()
+
+
+@_by_text
+def test_a_quoted_figure_is_of_the_stated_size(entry: dict[str, Any]) -> None:
+    for value in entry["values"]:
+        line = _line(value)
+        assert {key: line.get(key) for key in entry.get("where", {})} == entry.get("where", {})
+
+
+@pytest.mark.parametrize(
+    "commit", sorted({_line(value)["commit"] for entry in _QUOTED for value in entry["values"]})
+)
+def test_a_quoted_figure_is_not_too_old(commit: str) -> None:
+    if _git("rev-parse", "--is-shallow-repository") != "false":
+        pytest.skip("the history is not here")
+    assert _days_behind(commit) <= _MOST_DAYS
+
+
+@pytest.mark.parametrize("table", _TABLES, ids=lambda table: table[:40])
+def test_a_table_of_readme_is_that_of_the_lines(table: str) -> None:
+    assert table in _README
+    if _git("rev-parse", "--is-shallow-repository") == "false":
+        for commit in table.rpartition("commit ")[2].rstrip(".").split(", "):
+            assert _days_behind(commit) <= _MOST_DAYS
 
 
 def test_every_measurement_has_a_line() -> None:
     page = re.sub(r"```.*?```|^    .*?$", "", _README, flags=re.DOTALL | re.MULTILINE)
-    for entry in _QUOTED:
-        page = page.replace(_rendered(entry), "")
+    for known in [*map(_rendered, _QUOTED), *_TABLES]:
+        page = page.replace(known, "")
     assert _MEASURED.findall(page) == []
 
 

@@ -1,0 +1,107 @@
+"""Prints README's tables of speeds and trainers from `benchmarks/results/suites.jsonl`.
+
+`python docs/_ext/readme_tables.py`. Of equal measurements, the newest counts. All figures of a
+table must come from one commit on one device, which is printed below it.
+"""
+
+import json
+import statistics
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+Line = dict[str, Any]
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "suites.jsonl"
+CARD, CORES = "1 x NVIDIA H200", "CPU x86_64, 2 cores"
+ARENAS = (4096, 16384, 65536)
+ENVIRONMENTS = {
+    "**swarmjax**, rigid contacts": {"benchmark": "steps_per_second.environment"},
+    "JaxMARL JaxNav, kinematic": {"benchmark": "peer_jaxnav.environment", "reset": "pool"},
+    "CAMAR, penalty forces, 3 substeps": {"benchmark": "peer_camar.environment"},
+    "VMAS, penalty forces, 2 substeps, no resets": {"benchmark": "peer_vmas.environment"},
+}
+TRAINERS = {
+    "**swarmjax**": "swarmjax",
+    "Brax PPO, our settings": "Brax PPO, this environment",
+    "Brax PPO, MuJoCo Playground's settings": (
+        "Brax PPO as MuJoCo Playground sets it, this environment"
+    ),
+}
+ON_CORES = {
+    "**swarmjax**, 128 arenas": {"benchmark": "steps_per_second.training", "arenas": 128},
+    "BenchMARL IPPO, VMAS, 64 arenas": {"benchmark": "peer_benchmarl"},
+    "Stable-Baselines3, MuJoCo C, 16 arenas": {"benchmark": "cpu_sb3"},
+    "PPO-PyTorch's way, MuJoCo C, one arena": {"benchmark": "cpu_paper_way"},
+}
+
+
+def read() -> list[Line]:
+    """Reads the lines of planar robots, newest last."""
+    lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
+    return [line for line in lines if line.get("robot", "planar") == "planar"]
+
+
+def find(lines: list[Line], **where: Any) -> list[Line]:
+    """Returns the lines with these entries that are of the newest commit among them."""
+    found = [line for line in lines if all(line.get(k) == v for k, v in where.items())]
+    return [line for line in found if line["commit"] == found[-1]["commit"]]
+
+
+def tables(lines: list[Line]) -> Iterator[str]:
+    """Yields the tables of environments, trainers, and trainers on two cores."""
+    used: list[Line] = []
+    heads = [f"{arenas:,} arenas" for arenas in ARENAS]
+    rows = []
+    for name, where in ENVIRONMENTS.items():
+        each = [find(lines, device=CARD, arenas=arenas, **where)[-1] for arenas in ARENAS]
+        rows.append([name, *(_millions(line["robot_steps_per_s"]) for line in each)])
+        used += each
+    yield _table(["environment, robot steps/s", *heads], rows, used)
+    yield _of_trainers(lines)
+    chosen = {name: find(lines, device=CORES, **where)[-1] for name, where in ON_CORES.items()}
+    rows = [[name, f"{line['transitions_per_s']:,.0f}"] for name, line in chosen.items()]
+    yield _table(["training on two cores", "transitions/s"], rows, list(chosen.values()))
+
+
+def _of_trainers(lines: list[Line]) -> str:
+    heads = ["training, 8,192 arenas", "transitions/s", "arena steps/s", "s to 90 % of targets"]
+    rows, used = [], []
+    for name, trainer in TRAINERS.items():
+        seeds = find(lines, device=CARD, benchmark="race", trainer=trainer)
+        speeds = [_median(seeds, key) for key in ("transitions_per_s", "arena_steps_per_s")]
+        rows.append([name, *map(_millions, speeds), _seconds(seeds)])
+        used += seeds
+    return _table(heads, rows, used)
+
+
+def _seconds(seeds: list[Line]) -> str:
+    """Returns the median and range of the seconds to 90 %, and how many seeds never got there."""
+    found = sorted(s for line in seeds if (s := line["seconds_to_0.90"]) is not None)
+    first = any(line["curve"][0][0] >= s for line in seeds for s in found[:1])
+    text = f"{'at most ' if first else ''}{statistics.median(found):.2f}"
+    text += f" ({found[0]:.2f} to {found[-1]:.2f})" if len(found) > 1 else ""
+    never = len(seeds) - len(found)
+    return text + f"; {len(seeds)} seed{'s' * (len(seeds) > 1)}" + f", {never} never" * (never > 0)
+
+
+def _median(lines: list[Line], key: str) -> float:
+    return statistics.median(line[key] for line in lines)
+
+
+def _millions(value: float) -> str:
+    return f"{value / 1e6:.{0 if value >= 1e8 else 1}f} M"
+
+
+def _table(heads: list[str], rows: list[list[str]], used: list[Line]) -> str:
+    """Lays out a table, and names the commits and the device."""
+    commits = sorted({line["commit"][:7] for line in used})
+    devices = {line["device"] for line in used}
+    assert len(devices) == 1
+    body = [heads, ["---", *["--:"] * (len(heads) - 1)], *rows]
+    text = "\n".join(f"| {' | '.join(row)} |" for row in body)
+    return f"{text}\n\n{devices.pop()}; commit {', '.join(commits)}.\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write("\n".join(tables(read())))
