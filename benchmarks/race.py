@@ -9,7 +9,7 @@ evenly spaced over the budget.
 
 Brax differs in these points:
 
-- one constant learning rate for actor and critic, our actor's;
+- one constant learning rate for actor and critic, our actor's with `settings=ours`;
 - Adam's epsilon;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;

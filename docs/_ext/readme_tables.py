@@ -1,7 +1,7 @@
 """Prints README's tables of speeds and trainers from `benchmarks/results/suites.jsonl`.
 
-`python docs/_ext/readme_tables.py`. Of equal measurements, the newest counts. All figures of a
-table must come from one commit on one device, which is printed below it.
+`python docs/_ext/readme_tables.py`. Of equal measurements, those of the newest commit count. All
+figures of a table must come from one commit on one device, which is printed below it.
 """
 
 import json
@@ -30,8 +30,8 @@ TRAINERS = {
 }
 ON_CORES = {
     "**swarmjax**, 128 arenas": {"benchmark": "steps_per_second.training", "arenas": 128},
-    "BenchMARL IPPO, VMAS, 64 arenas": {"benchmark": "peer_benchmarl"},
-    "Stable-Baselines3, MuJoCo C, 16 arenas": {"benchmark": "cpu_sb3"},
+    "BenchMARL IPPO, VMAS, 64 arenas": {"benchmark": "peer_benchmarl", "arenas": 64},
+    "Stable-Baselines3, MuJoCo C, 16 arenas": {"benchmark": "cpu_sb3", "arenas": 16},
     "PPO-PyTorch's way, MuJoCo C, one arena": {"benchmark": "cpu_paper_way"},
 }
 
@@ -68,7 +68,7 @@ def _of_trainers(lines: list[Line]) -> str:
     heads = ["training, 8,192 arenas", "transitions/s", "arena steps/s", "s to 90 % of targets"]
     rows, used = [], []
     for name, trainer in TRAINERS.items():
-        seeds = find(lines, device=CARD, benchmark="race", trainer=trainer)
+        seeds = find(lines, device=CARD, benchmark="race", trainer=trainer, arenas=8192)
         speeds = [_median(seeds, key) for key in ("transitions_per_s", "arena_steps_per_s")]
         rows.append([name, *map(_millions, speeds), _seconds(seeds)])
         used += seeds
@@ -78,7 +78,9 @@ def _of_trainers(lines: list[Line]) -> str:
 def _seconds(seeds: list[Line]) -> str:
     """Returns the median and range of the seconds to 90 %, and how many seeds never got there."""
     found = sorted(s for line in seeds if (s := line["seconds_to_0.90"]) is not None)
-    first = any(line["curve"][0][0] >= s for line in seeds for s in found[:1])
+    if not found:
+        return f"never; {len(seeds)} seeds"
+    first = any(line["curve"][0][1] >= 0.9 for line in seeds)  # judged for the first time
     text = f"{'at most ' if first else ''}{statistics.median(found):.2f}"
     text += f" ({found[0]:.2f} to {found[-1]:.2f})" if len(found) > 1 else ""
     never = len(seeds) - len(found)
@@ -95,12 +97,11 @@ def _millions(value: float) -> str:
 
 def _table(heads: list[str], rows: list[list[str]], used: list[Line]) -> str:
     """Lays out a table, and names the commits and the device."""
-    commits = sorted({line["commit"][:7] for line in used})
-    devices = {line["device"] for line in used}
-    assert len(devices) == 1
+    commits, devices = {line["commit"][:7] for line in used}, {line["device"] for line in used}
+    assert len(commits) == len(devices) == 1
     body = [heads, ["---", *["--:"] * (len(heads) - 1)], *rows]
     text = "\n".join(f"| {' | '.join(row)} |" for row in body)
-    return f"{text}\n\n{devices.pop()}; commit {', '.join(commits)}.\n"
+    return f"{text}\n\n{devices.pop()}; commit {commits.pop()}.\n"
 
 
 if __name__ == "__main__":

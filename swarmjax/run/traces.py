@@ -3,7 +3,7 @@
 The key of a compiled program (`compile_cache`) is the traced and lowered program itself, so a start
 with a full cache still traces. Therefore the lowered program is kept in the same directory, under a
 digest of all that a trace depends on: the files of this package, versions, device, JAX's options,
-settings and world. XLA compiles it, or loads it from its cache, as before.
+settings, world and the calls of Warp before it. XLA compiles it, or loads it from its cache.
 """
 
 import contextlib
@@ -56,7 +56,10 @@ def keep(
     shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
     fast = dispatch.load_fast("arenas_warp", program.world.physics.engine.impl)
     before = [] if fast is None else list(fast.CALLS)  # they number the calls of the next trace
-    key = hashlib.sha256(f"{_digest(program)} {shapes}".encode() + pickle.dumps(before))
+    # Call by call, because `pickle` writes what calls share only once, and a repeated call shares
+    # other things than a traced one.
+    calls = [pickle.dumps(solve) + repr(given).encode() for solve, given in before]
+    key = hashlib.sha256(b"".join([f"{_digest(program)} {shapes}".encode(), *calls]))
     path = Path(folder) / f"{name}-{key.hexdigest()}.trace"
     try:
         traced, calls = pickle.loads(zlib.decompress(path.read_bytes()))

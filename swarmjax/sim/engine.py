@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ from jax import Array
 OTHERS_PER_ROBOT = 3
 # Most contacts per robot in one arena. A disc touches at most six neighbours of its size at once.
 ROWS_PER_ROBOT = 6
+_STARTING = threading.Lock()  # `train` starts Warp in a thread, and two starts would make two of it
 FEW_ARENAS = 64  # up to this number, all arenas may be crowded, so every pair gets memory
 
 # Types of MJX, in either implementation, or of a faster engine with the same field names.
@@ -92,8 +94,9 @@ def start_warp() -> None:
     """Starts Warp without its banner and without the name of every kernel that it loads."""
     import warp
 
-    warp.config.log_level = warp.LOG_ERROR
-    warp.init()
+    with _STARTING:
+        warp.config.log_level = warp.LOG_ERROR
+        warp.init()
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:

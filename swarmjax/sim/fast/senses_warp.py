@@ -41,7 +41,7 @@ def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, lim
 
     Returns:
       [K + 3, R, 2] m, and reflectances. The first K rows are the rays, the others the gaps to the
-      nearest `gaps.KINDS`. Gaps above `limit` are infinite.
+      nearest `gaps.KINDS`. A gap above `limit` is any number above it, or infinite.
     """
     return over_arenas(functools.partial(_look, poses, hull_radius, limit), scene)
 
