@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
 
         settings = load_run(arguments)
         if not settings.run.distributed:  # whose processes first have to find each other
-            threading.Thread(target=_open_device).start()
+            threading.Thread(target=_open_device, args=(settings.sim.impl,)).start()
         from swarmjax.run.display import Display
         from swarmjax.run.run import Run
 
@@ -48,16 +48,16 @@ def main(arguments: Sequence[str]) -> int:
         return stop.code or 0
 
 
-def _open_device() -> None:
+def _open_device(impl: str) -> None:
     """Opens a GPU for JAX and Warp, which takes 2 s, while the main thread imports its modules."""
     with contextlib.suppress(Exception):  # the run meets the same error, and reports it
         import jax
         import numpy as np
 
         jax.block_until_ready(jax.device_put(np.zeros(1)))
-        if jax.default_backend() == "gpu":
-            from swarmjax.sim import engine
+        from swarmjax.sim import dispatch, engine
 
+        if dispatch.resolve_impl(impl) == "warp":
             engine.start_warp()
 
 

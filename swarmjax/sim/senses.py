@@ -19,14 +19,14 @@ class Scene(NamedTuple):
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones are parked far away.
       turn: [R, K] by how much each sensor is turned to the left, rad; None: 0.
-      shades: reflectances of surfaces.
+      shades: reflectances of surfaces; None if all are 1.
     """
 
     pose: Array
     side: Array
     obstacle: Array
     turn: Any = None
-    shades: Reflectance = Reflectance()
+    shades: Reflectance | None = None
 
 
 class Surround(NamedTuple):
@@ -58,21 +58,20 @@ def look(scene: Scene, poses: Any, hull_radius: float, limit: float, impl: str =
     Returns:
       What surrounds each robot.
     """
-    shines = any(part is not None for part in scene.shades)
     fast = dispatch.load_fast("senses_warp", impl)
     if fast is not None:
         found = fast.look(scene, poses, hull_radius, limit)
         ray, bright = (jnp.swapaxes(found[: len(poses), :, i], 0, 1) for i in range(2))
         gap, complete = found[len(poses) :, :, 0].T, jnp.asarray(True)
-        return Surround(ray, bright if shines else None, gap, complete)
+        return Surround(ray, bright if scene.shades else None, gap, complete)
     pose, side, obstacle, turn, shades = scene
     near = neighbours.look(pose, hull_radius, limit, jnp)
     gap = sim_gaps.gaps(pose, side, obstacle, hull_radius, jnp, near)
     arena, mount = (pose, side, obstacle, hull_radius, limit), Mount(poses, turn)
-    if shines:
-        ray, bright = infrared.sights(*arena, shades, mount, near)
-    else:
+    if shades is None:
         ray, bright = infrared.distances(*arena, jnp, mount, near), None
+    else:
+        ray, bright = infrared.sights(*arena, shades, mount, near)
     # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
     # on a GPU.
     ray, bright = jax.lax.optimization_barrier((ray, bright))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from swarmjax.sim import dispatch, infrared, physics, senses
+from swarmjax.sim import dispatch, physics, senses
 from swarmjax.sim import drive as sim_drive
 from swarmjax.sim import gaps as sim_gaps
 from swarmjax.sim.senses import Surround
@@ -198,17 +198,14 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     earns = ends if turn.earns is None else turn.earns
     earned = _reward_step(world, state, after, looked, earns, begins, pose, action)
     gained = reward.total(earned, world.task.reward, world.terms)
-    sound &= (
-        around.complete & _is_finite(gained, active) & _is_finite(sight.distance, level.present)
-    )
-    sound &= _is_finite(seen, level.present[:, None])
+    sound &= around.complete & _is_finite(gained, active)
+    sound &= _is_finite(sight.distance, level.present) & _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
     # Learning skips the step of a broken arena, so the critic need not see it either.
     seen = jnp.where(sound, seen, state.observation)
-    episode = _tally(
-        state.episode, gained, begins, earned, valid & world.goal.is_under_way(state.arrived)
-    )
+    counted = valid & world.goal.is_under_way(state.arrived)
+    episode = _tally(state.episode, gained, begins, earned, counted)
     timeout = clock >= world.task.step_limit
     return replace(after, observation=seen, episode=episode), TimeStep(
         observation=seen,
@@ -299,7 +296,7 @@ def _move(
 def _look(world: World, pose: Array, level: Level, factors: Factors) -> tuple[Sight, Surround]:
     """Looks around from poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
-    shades = infrared.Reflectance(factors.reflectance, factors.reflectance_robot)
+    shades = task_electronics.reflectance(factors)
     scene = senses.Scene(pose, level.side, level.obstacle, factors.infrared_yaw, shades)
     robot, impl = world.robot, world.physics.engine.impl
     around = senses.look(

@@ -52,3 +52,13 @@ def cell_at(x: float, width: float) -> int:
     """Returns the cell along an axis, before the grid repeats; NaN has a cell, too."""
     across = x / width
     return int(wp.floor(wp.where(across > -_FAR, wp.min(across, _FAR), -_FAR)))
+
+
+@wp.func
+def cells_around(x: float, reach: float, width: float, across: int) -> wp.vec2i:
+    """Returns the first cell within reach along an axis, and the end of them.
+
+    They are no more than the grid has (`across`), or a robot would be found twice.
+    """
+    first = cell_at(x - reach, width)
+    return wp.vec2i(first, wp.min(cell_at(x + reach, width) + 1, first + across))

@@ -203,13 +203,11 @@ def _list_near(
     box = _box_of(arena, owner, width)
     reach_x = wp.abs(box.cos) * box.half_x + wp.abs(box.sin) * box.half_y + 0.5 * width
     reach_y = wp.abs(box.sin) * box.half_x + wp.abs(box.cos) * box.half_y + 0.5 * width
-    x, y = cells_warp.cell_at(box.x - reach_x, width), cells_warp.cell_at(box.y - reach_y, width)
-    # No more columns and rows than the grid has, or a robot would be found twice.
-    end_x = wp.min(cells_warp.cell_at(box.x + reach_x, width) + 1, x + across)
-    end_y = wp.min(cells_warp.cell_at(box.y + reach_y, width) + 1, y + across)
+    columns = cells_warp.cells_around(box.x, reach_x, width, across)
+    rows = cells_warp.cells_around(box.y, reach_y, width, across)
     known = wp.int32(0)
-    for column in range(x, end_x):
-        for row in range(y, end_y):
+    for column in range(columns[0], columns[1]):
+        for row in range(rows[0], rows[1]):
             robot = wp.int32(first[i, column & (across - 1), row & (across - 1)])
             while robot >= 0:
                 known = _list_robot(arena, start, known, box, owner - fixtures, robot)

@@ -68,9 +68,9 @@ def _with_last(sensor: infrared.Ray, *last: float) -> Array:
     return jnp.concatenate([rows, row], axis=2)
 
 
-def _shades(shades: infrared.Reflectance, pose: Array, obstacle: Array) -> Array:
+def _shades(shades: infrared.Reflectance | None, pose: Array, obstacle: Array) -> Array:
     """Returns reflectances of walls, boxes and robots, [A, 1 + M + R]; a single 1 for all ones."""
-    if all(shade is None for shade in shades):
+    if shades is None:
         return jnp.ones((1, 1))
     (arenas, robots), boxes = pose.shape[:2], obstacle.shape[1]
     each = zip(shades, (1 + boxes, robots), strict=True)
@@ -152,18 +152,16 @@ def _look_around(
         _see_box(look, obstacle[i, m], shade[shades, wp.min(1 + m, last)])
     chain, links = wp.min(i, first.shape[0] - 1), wp.min(i, after.shape[0] - 1)
     across, width = first.shape[1], look.reach + look.hull
-    x, y = look.place[0] - width, look.place[1] - width
-    column, row = cells_warp.cell_at(x, width), cells_warp.cell_at(y, width)
-    # No more columns and rows than the grid has, or a robot would be found twice.
-    columns = wp.min(cells_warp.cell_at(x + 2.0 * width, width) - column + 1, across)
-    rows = wp.min(cells_warp.cell_at(y + 2.0 * width, width) - row + 1, across)
-    for cell in range(columns * rows):
-        at_x, at_y = (column + cell // rows) & (across - 1), (row + cell % rows) & (across - 1)
-        other = wp.int32(first[chain, at_x, at_y])
-        while other >= 0:
-            if other != robot:
-                _see_robot(look, place[i, other], shade[shades, wp.min(1 + boxes + other, last)])
-            other = after[links, other]
+    columns = cells_warp.cells_around(look.place[0], width, width, across)
+    rows = cells_warp.cells_around(look.place[1], width, width, across)
+    for column in range(columns[0], columns[1]):
+        for row in range(rows[0], rows[1]):
+            other = wp.int32(first[chain, column & (across - 1), row & (across - 1)])
+            while other >= 0:
+                if other != robot:
+                    mine = wp.min(1 + boxes + other, last)
+                    _see_robot(look, place[i, other], shade[shades, mine])
+                other = after[links, other]
 
 
 @wp.func
