@@ -2,7 +2,7 @@
 
 `python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
 prints one table. `out` writes JSON lines: first a line with versions and commit, then a line for
-each row. `docs` writes the table into DIR/robot.md, between the page's two markers.
+each row. `docs` writes the table into DIR/robot-figures.md, between the page's two markers.
 
 Our numbers are read from the compiled model or from the simulated robot's motion. The benchmark
 writes the reference numbers down a second time, each with its source. If the robot and the
@@ -31,7 +31,7 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.task.stage_files import load_levels
 
 ROBOTS = ("planar", "wheeled", "planar_v2", "wheeled_v2")  # files of configs/robot/
-PAGE = "robot.md"
+PAGE = "robot-figures.md"
 MARKER = "fidelity"
 PLAIN_WIDTH = 180  # columns
 HEADS = ("quantity", "unit", "theirs", "source", "planar", "wheeled", "error")

@@ -180,16 +180,16 @@ def test_the_table_in_markdown() -> None:
 
 def test_the_table_replaces_what_stands_between_the_markers() -> None:
     page = "a\n<!-- fidelity -->\nold\n<!-- /fidelity -->\nb\n"
-    assert fidelity.insert(page, "robot.md", fidelity.MARKER, "new\n") == (
+    assert fidelity.insert(page, "page.md", fidelity.MARKER, "new\n") == (
         "a\n<!-- fidelity -->\n\nnew\n\n<!-- /fidelity -->\nb\n"
     )
 
 
 @pytest.mark.parametrize("page", ["", "<!-- fidelity -->", "<!-- /fidelity --><!-- fidelity -->"])
 def test_a_page_without_its_markers_is_refused(page: str) -> None:
-    sentence = refusal(fidelity.insert, page, "robot.md", fidelity.MARKER, "new")
+    sentence = refusal(fidelity.insert, page, "page.md", fidelity.MARKER, "new")
     assert sentence == (
-        "robot.md has no place for the table: give it <!-- fidelity --> and <!-- /fidelity -->."
+        "page.md has no place for the table: give it <!-- fidelity --> and <!-- /fidelity -->."
     )
 
 
