@@ -1,8 +1,7 @@
 """How realistic is the simulated robot? Compares it with the real robot and with Webots' robot.
 
-`python -m benchmarks.fidelity [out=FILE] [docs=DIR]` measures both bodies in MuJoCo's C engine and
-prints one table. `out` writes JSON lines: first a line with versions and commit, then a line for
-each row. `docs` writes the table into DIR/robot-figures.md, between the page's two markers.
+`python -m benchmarks.fidelity [out=FILE]` measures both bodies in MuJoCo's C engine and prints one
+table. `out` writes JSON lines: first a line with versions and commit, then a line for each row.
 
 Our numbers are read from the compiled model or from the simulated robot's motion. The benchmark
 writes the reference numbers down a second time, each with its source. If the robot and the
@@ -31,8 +30,6 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.task.stage_files import load_levels
 
 ROBOTS = ("planar", "wheeled", "planar_v2", "wheeled_v2")  # files of configs/robot/
-PAGE = "robot-figures.md"
-MARKER = "fidelity"
 PLAIN_WIDTH = 180  # columns
 HEADS = ("quantity", "unit", "theirs", "source", "planar", "wheeled", "error")
 
@@ -42,7 +39,6 @@ class FidelityConfig(Section):
     """Settings: where to write the table, in addition to the terminal."""
 
     out: str | None = field(default=None, metadata=about("file of JSON lines"))
-    docs: str | None = field(default=None, metadata=about(f"folder of {PAGE}, for the table"))
 
 
 def rigs() -> list[Rig]:
@@ -117,56 +113,6 @@ def print_table(rows: Sequence[Row], console: Console) -> None:
     console.print(table)
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """Returns the table for the documentation, with a heading per section."""
-    found = []
-    for section, members in _sections(rows):
-        found += [f"### {section}", "", f"| {' | '.join(HEADS)} |", "|---|---|--:|---|--:|--:|--:|"]
-        found += [f"| {' | '.join(_cells(row))} |" for row in members]
-        found.append("")
-    return "\n".join(found)
-
-
-def insert(text: str, page: str, marker: str, part: str) -> str:
-    """Puts text between the markers `<!-- marker -->` and `<!-- /marker -->` of a page.
-
-    Args:
-      text: text of the whole page.
-      page: name of the page, for error messages.
-      marker: the word inside both markers.
-      part: text to put between the markers.
-
-    Returns:
-      The new text of the page.
-
-    Raises:
-      ConfigError: if a marker is missing, or the end marker comes before the begin marker.
-    """
-    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
-    before, begun, rest = text.partition(begin)
-    _, ended, after = rest.partition(end)
-    if not (begun and ended):
-        raise ConfigError(f"{page} has no place for the table: give it {begin} and {end}.")
-    return f"{before}{begin}\n\n{part}\n{end}{after}"
-
-
-def write_docs(folder: Path, rows: Sequence[Row]) -> None:
-    """Writes the table into the page.
-
-    Args:
-      folder: folder of the page.
-      rows: rows of the table.
-
-    Raises:
-      ConfigError: if the page is missing, or has no place for the table.
-    """
-    path = folder / PAGE
-    try:
-        path.write_text(insert(path.read_text(), PAGE, MARKER, markdown(rows)))
-    except OSError as error:
-        raise ConfigError(f"docs is {folder}, which cannot be used: {error.strerror}.") from None
-
-
 def write_lines(path: Path, rows: Sequence[Row]) -> None:
     """Writes the JSON lines; raises ConfigError if the file cannot be written."""
     content = [head(), *(row.line() for row in rows)]
@@ -183,8 +129,6 @@ def main(arguments: Sequence[str]) -> int:
     rows = measure(rigs())
     if settings.out is not None:
         write_lines(Path(settings.out), rows)
-    if settings.docs is not None:
-        write_docs(Path(settings.docs), rows)
     print_table(rows, Console())
     return 0
 

@@ -1,11 +1,13 @@
 """Tests the table of benchmarks.fidelity: its form, and some rows worked out by hand."""
 
+import io
 import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from sentences import refusal
 
 from benchmarks import fidelity, fidelity_infrared, fidelity_motion, lines
@@ -169,28 +171,14 @@ ROWS = [
 ]
 
 
-def test_the_table_in_markdown() -> None:
-    head = "| quantity | unit | theirs | source | planar | wheeled | error |"
-    rule = "|---|---|--:|---|--:|--:|--:|"
-    assert fidelity.markdown(ROWS).splitlines() == [
-        *("### One", "", head, rule, "| q | m | 2 | a | 1 |  | 50.00 % |", ""),
-        *("### Two", "", head, rule, "| r | 1 |  | b | 0 | 12.346 |  |"),
+def test_the_table_has_a_part_for_each_section() -> None:
+    console = Console(file=io.StringIO(), width=80)
+    fidelity.print_table(ROWS, console)
+    assert [line.split() for line in console.file.getvalue().splitlines()] == [
+        ["quantity", "unit", "theirs", "source", "planar", "wheeled", "error"],
+        *(["One"], ["q", "m", "2", "a", "1", "50.00", "%"]),
+        *(["Two"], ["r", "1", "b", "0", "12.346"]),
     ]
-
-
-def test_the_table_replaces_what_stands_between_the_markers() -> None:
-    page = "a\n<!-- fidelity -->\nold\n<!-- /fidelity -->\nb\n"
-    assert fidelity.insert(page, "page.md", fidelity.MARKER, "new\n") == (
-        "a\n<!-- fidelity -->\n\nnew\n\n<!-- /fidelity -->\nb\n"
-    )
-
-
-@pytest.mark.parametrize("page", ["", "<!-- fidelity -->", "<!-- /fidelity --><!-- fidelity -->"])
-def test_a_page_without_its_markers_is_refused(page: str) -> None:
-    sentence = refusal(fidelity.insert, page, "page.md", fidelity.MARKER, "new")
-    assert sentence == (
-        "page.md has no place for the table: give it <!-- fidelity --> and <!-- /fidelity -->."
-    )
 
 
 def test_lines_of_json(tmp_path: Path) -> None:
@@ -207,18 +195,10 @@ def test_lines_of_json(tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
     assert "out is" in refusal(fidelity.write_lines, tmp_path, ROWS)
-    assert "docs is" in refusal(fidelity.write_docs, tmp_path / "none", ROWS)
-
-
-def test_the_page_gets_its_table(tmp_path: Path) -> None:
-    page = Path(fidelity.__file__).parents[1] / "docs" / fidelity.PAGE
-    (tmp_path / fidelity.PAGE).write_text(page.read_text())
-    fidelity.write_docs(tmp_path, ROWS)
-    assert fidelity.markdown(ROWS) in (tmp_path / fidelity.PAGE).read_text()
 
 
 @pytest.mark.parametrize(
-    ("word", "part"), [("dcs=x", "did you mean docs?"), ("out", "give key=value")]
+    ("word", "part"), [("ot=x", "did you mean out?"), ("out", "give key=value")]
 )
 def test_words_that_are_refused(word: str, part: str) -> None:
     assert part in refusal(lines.load, fidelity.FidelityConfig, [word])
