@@ -3,8 +3,8 @@
 A piece is a function with one of the decorators below; a network is a Flax module, and a goal a
 class. Commands take the file as `extensions=FILE`. `make_env` and `train_policy` also take a module
 or a list of pieces. All pieces of a file are used unless a setting says otherwise.
-docs/extending.md has an example of each kind. Loading a file executes it. Importing this module
-does not import JAX.
+docs/extending.md and examples/own_pieces.py have an example of each kind. Loading a file executes
+it. Importing this module does not import JAX.
 """
 
 import ast
