@@ -30,7 +30,7 @@ nitpicky = True
 # What the site has no page of: other packages, and what users have no need to call.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!swarmjax\.).*"),
-    ("py:class", r"swarmjax\.(training|task\.(env|stage)|adapters\.\w+|sim|run)\..*"),
+    ("py:class", r"swarmjax\.(training|task\.(env|stage|world)|adapters\.\w+|sim|run)\..*"),
 ]
 
 # Notebooks: each runs in a folder of its own, and one that fails fails the build.
