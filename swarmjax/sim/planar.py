@@ -189,8 +189,7 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 PLANAR = Body(
     gravity=False,
     # With this cone, a hull's push and its friction are two separate forces, and contacts are as
-    # soft as without friction. Planar friction has only two cone edges, so it is exactly Coulomb's
-    # (docs/design-notes.md).
+    # soft as without friction. Planar friction has only two cone edges, so it is exactly Coulomb's.
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,

@@ -241,7 +241,7 @@ def test_warp_steps_the_arenas_of_all_seeds_each_with_its_own_model(
 
     found = jax.jit(jax.vmap(jax.vmap(drive)))(obstacle.reshape(lanes, arenas, 2, 5))
     met = 0.1 - half - tiny_config.robot.hull_radius
-    # A robot that pushes against a box sinks in by at most 4 mm (docs/design-notes.md, solver).
+    # A robot that pushes against a box sinks in by at most 4 mm.
     np.testing.assert_allclose(np.ravel(found[:, :, 1, 1]), met, rtol=0.0, atol=4e-3)
     np.testing.assert_array_equal(found.reshape(-1, 3, 3), jax.jit(jax.vmap(drive))(obstacle))
 
