@@ -49,7 +49,6 @@ def render(
     *,
     styles: Sequence[str] = (STYLE,),
     script: str = "",
-    sources: Mapping[str, str] | None = None,
     **values: Any,
 ) -> str:
     """Lays out a page.
@@ -58,8 +57,6 @@ def render(
       template: template of the page; it extends `pages/base.html`.
       styles: names of the style sheets; later rules override earlier ones.
       script: script of the page, if any. It must come from `swarmjax`, since it is not escaped.
-      sources: what else the page may load, by directive of its content security policy. Its own
-        style, script and embedded pictures are always allowed.
       values: values for the template. They are escaped.
 
     Returns:
@@ -71,7 +68,6 @@ def render(
         "img-src": "data:",
         "style-src": _hash_source(style),
         **({"script-src": _hash_source(script)} if script else {}),
-        **(sources or {}),
         "base-uri": "'none'",
         "form-action": "'none'",
     }

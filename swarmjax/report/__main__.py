@@ -48,7 +48,8 @@ def write(run: Path, out: Path, made_by: str) -> list[Path]:
     from swarmjax.report import figures as report_figures
 
     figures = report_figures.png_files(history)
-    page = report_page.page(f"Report of {run}", made_by, history, figures)
+    replay = report_page.replay(run, out)
+    page = report_page.page(f"Report of {run}", made_by, history, figures, replay)
     content = {f"{name}.png": png for name, png in figures.items()} | {PAGE: page.encode()}
     return builder.write(out, content)
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -39,21 +38,15 @@ def success(groups: Sequence[Group], stages: Sequence[str]) -> Figure:
     first = groups[0].histories[0]
     last_step = max(min(each.arena_steps[-1] for each in group.histories) for group in groups)
     titles = [_title(groups, name) for name in stages]
-    figure, panels = report_figures.success_panels(last_step, titles)
-    looks = _looks(len(groups))
+    figure, panels = report_figures.over_training(last_step, titles)
+    colours = report_figures.colours(len(groups))
+    looks = [{"color": c, "ls": _STYLES[i % len(_STYLES)]} for i, c in enumerate(colours)]
     for group, look in zip(groups, looks, strict=True):
         for name, panel in zip(stages, panels, strict=True):
             _draw(panel, *_joined(group, first.decided_by, name), look)
     figure.supylabel(f"{rows.measure(first)}, interquartile mean", fontsize=10)
     _explain(figure, [group.line for group in groups], looks)
     return figure
-
-
-def _looks(count: int) -> list[dict[str, Any]]:
-    """Makes the colour and style of each curve."""
-    # A lighter line than at 0.85 is hard to see on white.
-    colours = colormaps["viridis"](np.linspace(0.0, 0.85, count))
-    return [{"color": c, "ls": _STYLES[i % len(_STYLES)]} for i, c in enumerate(colours)]
 
 
 def _joined(group: Group, measure: str, stage: str) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +67,7 @@ def _draw(panel: Axes, steps: np.ndarray, success: np.ndarray, look: Mapping[str
     if not len(whole):
         return
     at = whole[report_figures.spread(len(whole), _POINTS)]
-    panel.plot(steps[at], iqm(success[:, at], axis=0), lw=2.0, **look)
+    report_figures.line(panel, steps[at], np.asarray(iqm(success[:, at], axis=0)), lw=2.0, **look)
     if len(success) >= LEAST_DRAWN:
         band = curve(success[:, at])
         panel.fill_between(steps[at], band.low, band.high, color=look["color"], alpha=0.2, lw=0)
@@ -101,7 +94,7 @@ def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping
 
 
 def _label(line: TableLine) -> str:
-    """Names a curve as the table does. A label that began with _ would be left out."""
-    place, settings = table.cells(line)[0][-_LONGEST:], line.settings[:_LONGEST]
-    label = f"{words.count(len(line.seeds), 'seed')}: {place}  {settings}"
+    """Names a curve by its settings, seeds and place."""
+    place, seeds = table.cells(line)[-1], words.count(len(line.seeds), "seed")
+    label = f"{line.settings[:_LONGEST]} ({seeds}, {place[-_LONGEST:]})".lstrip()
     return label.replace("$", r"\$")  # else two of them would begin a formula

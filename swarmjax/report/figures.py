@@ -6,6 +6,7 @@ The colour map viridis rises evenly in lightness, so stages can also be told apa
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -20,10 +21,8 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.goals.goal import MEASURED
 
-_POINTS, _STRETCHES = 600, 200  # points of a curve, and stretches of a band: about one per pixel
-_NAMED = 24  # stages named in the legend of the mix; more names would take the figure's place
+_STRETCHES = 200  # of a curve or band: about one per pixel
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
-_STEPS = "arena control steps per seed"
 _CURVES = {
     "return": "return per robot",
     "contacts_per_robot": "contacts per robot",
@@ -37,88 +36,67 @@ def png_files(history: History) -> dict[str, bytes]:
     """Draws the figures of a run.
 
     Returns:
-      PNG files by name: `mix`, `success`, and `curves` if the run recorded them. The same run
-      gives the same files, since they do not hold Matplotlib's version.
+      PNG files by name: `success`; `stages` and `mix` if there are several stages; and `curves`
+      if the run recorded them. The same run gives the same files, since they do not hold
+      Matplotlib's version.
     """
-    files = {}
-    makers = {"mix": mix, "success": success, "curves": curves}
-    for name, make in makers.items():
-        figure = make(history)
-        if figure is not None:
-            files[name] = drawing.png(figure)
-    return files
+    several = {"stages": stages, "mix": mix} if len(history.names) > 1 else {}
+    figures = {name: make(history) for name, make in (several | {"curves": curves}).items()}
+    files = {"success": drawing.png(success(history), 2 * drawing.DOTS)}  # it is shown large
+    return files | {name: drawing.png(each) for name, each in figures.items() if each is not None}
 
 
 def mix(history: History) -> Figure:
     """Draws each stage's share of the arenas, stacked, as the mean over seeds."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
-    names = history.labels
-    colours = colormaps["viridis"](np.linspace(0.0, 1.0, len(names)))
-    figure = Figure(figsize=(drawing.WIDTH, 4.2), layout="constrained")
-    axes = figure.subplots()
+    figure, [panel] = over_training(steps[-1], [""])
     # The mix of an update holds from the end of the update before it.
-    axes.stackplot(
+    panel.stackplot(
         np.concatenate([[0], steps]),
         np.concatenate([bands[:, :1], bands], axis=1),
-        colors=colours,
+        colors=colours(len(history.names)),
         step="pre",
         linewidth=0,
         antialiased=False,  # else the background shows between two bands
     )
-    axes.set(xlim=(0, steps[-1]), ylim=(0, 1), xlabel=_STEPS)
+    panel.set_ylim(0, 1)
     seeds = len(history.seeds)
-    axes.set_ylabel("share of the arenas" + (f", mean of {seeds} seeds" if seeds > 1 else ""))
-    axes.xaxis.set_major_formatter(drawing.thousands())
-    axes.yaxis.set_major_formatter(drawing.percent())
-    every = math.ceil(len(names) / _NAMED)
-    rows = range(len(names) - 1, -1, -every)  # from the top; always names the last stage, the goal
-    drawing.explain(figure, [Patch(color=colours[i], label=names[i]) for i in rows], 6)
+    means = f", mean of {seeds} seeds" if seeds > 1 else ""
+    figure.supylabel(f"share of the arenas{means}", fontsize=10)
+    drawing.explain(figure, _stage_patches(history, 24), 6)
     return figure
 
 
 def success(history: History) -> Figure:
-    """Draws the success of each stage in its own panel: every seed, and their IQM."""
-    titles = [_title(history, i) for i in range(len(history.names))]
-    figure, panels = success_panels(history.arena_steps[-1], titles)
-    at = spread(len(history.updates), _POINTS)
-    steps = history.arena_steps[at]
-    mean = report_rows.together(history.success)[at]
-    thresholds = np.broadcast_to(history.config.curriculum.threshold, len(history.names))
-    for i, panel in enumerate(panels):
-        panel.plot(steps, history.success[:, at, i].T, color=_SEED, lw=0.7)
-        panel.plot(steps, mean[:, i], color=_ALL, lw=2.0)
-        if len(panels) > 1:
-            panel.axhline(thresholds[i], color=_LIMIT, lw=0.8, ls="--")
+    """Draws the learning curve: every seed on the last stage and their IQM; the IQM of others.
+
+    It is small in inches, so that its letters can be read on a telephone.
+    """
+    figure, [panel] = over_training(history.arena_steps[-1], [_title(history, -1)])
+    figure.set_size_inches(5.2, 3.6)
+    mean = report_rows.together(history.success).T
+    steps, shares = _stretched(history.arena_steps, mean[:-1])
+    for share, colour in zip(shares, colours(len(mean)), strict=False):
+        line(panel, steps, share, color=colour, lw=1.2)
+    _draw(panel, history.arena_steps, history.success[..., -1])
+    earlier = _stage_patches(history, 8)[1:]
+    drawing.explain(figure, [*_seed_lines(history), *earlier], 3 if earlier else 2)
     figure.supylabel(report_rows.measure(history), fontsize=10)
-    kinds = _seed_lines(history)
-    if len(panels) > 1:
-        kinds.append(Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes"))
-    drawing.explain(figure, kinds, 3)
     return figure
 
 
-def success_panels(last_step: int, titles: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """Makes a figure with a panel of success, 0 to 1, for each stage.
-
-    Args:
-      last_step: the last arena control step on the axis that all panels share.
-      titles: of each panel.
-    """
-    stages = len(titles)
-    columns = min(stages, 3 if stages <= report_rows.MANY else 6 if stages <= 30 else 8)
-    rows = math.ceil(stages / columns)
-    figure = Figure(figsize=(max(drawing.WIDTH, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
-    figure.set_layout_engine("constrained")
-    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-    for i, (panel, title) in enumerate(zip(panels, titles, strict=False)):
-        drawing.dress(panel, title, 7 if stages > report_rows.MANY else 10)
-        panel.tick_params(labelbottom=i + columns >= stages)
-    for panel in panels[stages:]:
-        panel.set_visible(False)
-    _label_steps(figure, last_step, 2 if stages > report_rows.MANY else 4)
-    panels[0].set_ylim(0, 1.02)
-    panels[0].yaxis.set_major_formatter(drawing.percent())
-    return figure, panels[:stages]
+def stages(history: History) -> Figure:
+    """Draws the success of each stage in its own panel: every seed, and their IQM."""
+    titles = [_title(history, i) for i in range(len(history.names))]
+    figure, panels = over_training(history.arena_steps[-1], titles)
+    thresholds = np.broadcast_to(history.config.curriculum.threshold, len(history.names))
+    for i, panel in enumerate(panels):
+        _draw(panel, history.arena_steps, history.success[..., i])
+        panel.axhline(thresholds[i], color=_LIMIT, lw=0.8, ls="--")
+    figure.supylabel(report_rows.measure(history), fontsize=10)
+    promotes = Line2D([], [], color=_LIMIT, lw=0.8, ls="--", label="promotes")
+    drawing.explain(figure, [*_seed_lines(history), promotes], 3)
+    return figure
 
 
 def curves(history: History) -> Figure | None:
@@ -128,21 +106,72 @@ def curves(history: History) -> Figure | None:
     """
     if all(np.isnan(values).all() for values in history.curves.values()):
         return None
-    figure = Figure(figsize=(drawing.WIDTH, 5.2), layout="constrained")
-    panels = list(figure.subplots(2, 3, sharex=True).flat)
     own = [key for key in history.curves if key.startswith(MEASURED)]
     titles = {key: key.removeprefix(MEASURED).replace("_", " ") for key in own} | _CURVES
-    for panel, (key, title) in zip(panels, titles.items(), strict=False):
-        steps, seeds = _stretched(history.arena_steps, history.curves[key])
-        panel.plot(steps, seeds.T, color=_SEED, lw=0.7)
-        panel.plot(steps, report_rows.together(seeds), color=_ALL, lw=2.0)
-        drawing.dress(panel, title)
-    for panel in panels[len(titles) :]:
-        panel.set_visible(False)
-    panels[2].tick_params(labelbottom=True)  # the last row may have no panel below this one
-    _label_steps(figure, history.arena_steps[-1], 4)
+    figure, panels = over_training(history.arena_steps[-1], [*titles.values()], are_shares=False)
+    for panel, key in zip(panels, titles, strict=True):
+        _draw(panel, history.arena_steps, history.curves[key])
     drawing.explain(figure, _seed_lines(history), 2)
     return figure
+
+
+def over_training(
+    last_step: int, titles: Sequence[str], *, are_shares: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """Makes a figure with a panel for each title, over the steps of training.
+
+    Args:
+      last_step: the last arena control step on the axis that all panels share.
+      titles: of each panel.
+      are_shares: whether the panels share an axis of 0 to 1.
+    """
+    count = len(titles)
+    columns = min(count, 3 if count <= report_rows.MANY else 6 if count <= 30 else 8)
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(max(drawing.WIDTH, 1.4 * columns), max(1.2 + 1.6 * rows, 4.2)))
+    figure.set_layout_engine("constrained")
+    panels = list(
+        figure.subplots(rows, columns, sharex=True, sharey=are_shares, squeeze=False).flat
+    )
+    for i, (panel, title) in enumerate(zip(panels, titles, strict=False)):
+        drawing.dress(panel, title, 7 if count > report_rows.MANY else 10)
+        panel.tick_params(labelbottom=i + columns >= count)
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    panels[0].set_xlim(0, last_step)
+    panels[0].xaxis.set_major_locator(MaxNLocator(2 if count > report_rows.MANY else 4))
+    panels[0].xaxis.set_major_formatter(drawing.thousands())
+    figure.supxlabel("arena control steps per seed", fontsize=10)
+    if are_shares:
+        panels[0].set_ylim(0, 1.02)
+        panels[0].yaxis.set_major_formatter(drawing.percent())
+    return figure, panels[:count]
+
+
+def colours(count: int) -> np.ndarray:
+    """Returns colours [count, 4] of stages or runs; a lighter line is hard to see on white."""
+    return colormaps["viridis"](np.linspace(0.0, 0.85, count))
+
+
+def line(panel: Axes, steps: np.ndarray, values: np.ndarray, **look: Any) -> None:
+    """Draws a curve through the values that there are; a single one is a dot."""
+    there = ~np.isnan(values)
+    panel.plot(steps[there], values[there], marker="o" if there.sum() == 1 else "", **look)
+
+
+def _draw(panel: Axes, steps: np.ndarray, seeds: np.ndarray) -> None:
+    """Draws every seed of values [N, T], and their interquartile mean."""
+    steps, seeds = _stretched(steps, seeds)
+    for values in seeds:
+        line(panel, steps, values, color=_SEED, lw=0.7)
+    line(panel, steps, report_rows.together(seeds), color=_ALL, lw=2.0)
+
+
+def _stage_patches(history: History, most: int) -> list[Patch]:
+    """Makes legend entries of at most so many stages, from the last one, which is the goal."""
+    names, looks = history.labels, colours(len(history.names))
+    every = range(len(names) - 1, -1, -math.ceil(len(names) / most))
+    return [Patch(color=looks[i], label=names[i]) for i in every]
 
 
 def spread(updates: int, points: int) -> np.ndarray:
@@ -178,12 +207,3 @@ def _seed_lines(history: History) -> list[Line2D]:
         Line2D([], [], color=_ALL, lw=2.0, label=f"interquartile mean of {seeds} seeds"),
         Line2D([], [], color=_SEED, lw=0.7, label="each seed"),
     ]
-
-
-def _label_steps(figure: Figure, last_step: int, ticks: int) -> None:
-    """Scales and labels the steps, an axis that all panels share."""
-    axis = figure.axes[0].xaxis
-    figure.axes[0].set_xlim(0, last_step)
-    axis.set_major_locator(MaxNLocator(ticks))
-    axis.set_major_formatter(drawing.thousands())
-    figure.supxlabel(_STEPS, fontsize=10)

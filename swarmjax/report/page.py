@@ -1,11 +1,13 @@
 """Builds the page of a report: one self-contained HTML file with its figures inside."""
 
-from collections.abc import Mapping, Sequence
+import os.path
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from swarmjax import words
+from swarmjax import command, words
 from swarmjax.config import files, to_dict
 from swarmjax.pages import builder
 from swarmjax.report import rows as report_rows
@@ -19,8 +21,8 @@ def page(
     command: str,
     history: History,
     figures: Mapping[str, bytes],
+    replay: tuple[str, str] = ("", ""),
     template: str = "report/report.html",
-    styles: Sequence[str] = STYLES,
     **values: Any,
 ) -> str:
     """Lays out the page.
@@ -29,9 +31,9 @@ def page(
       title: names the run.
       command: the command that makes the report.
       history: the run's history.
-      figures: PNG files by the names of the captions in `report.html`.
+      figures: PNG files by the names of the captions in `captions.html`.
+      replay: the address of the run's replay and the command that writes it, or empty texts.
       template: the template of the page; it extends `report.html`.
-      styles: names of its style sheets.
       values: further values for the template.
 
     Returns:
@@ -39,12 +41,13 @@ def page(
     """
     return builder.render(
         template,
-        styles=styles,
+        styles=STYLES,
         title=title,
         command=command,
         about=_facts(history),
         is_wide=len(history.names) > report_rows.MANY,
         figures=figures,
+        replay=replay,
         decisions=_decisions(history),
         reweighed=words.count(sum("weights" in row for row in history.decisions), "time"),
         stages=_stages(history),
@@ -53,37 +56,39 @@ def page(
 
 
 def _facts(history: History) -> list[tuple[str, str]]:
-    """States what the run is and its results, one fact per line.
-
-    Args:
-      history: the run's history.
-
-    Returns:
-      The heading and the text of each line.
-    """
-    trained, names = history.config, history.labels
-    options = files.flatten(to_dict(trained.curriculum))
-    seeds = f"{history.seeds[0]}" + (f" to {history.seeds[-1]}" if len(history.seeds) > 1 else "")
+    """States the results of a run in two lines, then what it is: heading and text of each line."""
+    trained, names, seeds = history.config, history.labels, history.seeds
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     spent += " (run.stop_at is reached)" if history.has_reached else ""
     time = "" if history.seconds is None else f", {words.duration(history.seconds)}"
-    stages = f"{len(names)}: {names[0]} to {names[-1]}" if len(names) > 1 else f"1: {names[0]}"
+    steps = f"{history.arena_steps[-1]:,} arena control steps per seed"
+    options = files.flatten(to_dict(trained.curriculum))
+    given = ", ".join(f"{key}={value}" for key, value in options.items() if value is not None)
     axes = f"; by {' · '.join(trained.curriculum.axes)}" if trained.curriculum.axes else ""
+    stages = [("stages", f"{len(names)}: {names[0]} to {names[-1]}{axes}"), ("curriculum", given)]
     return [
-        ("stages", stages + axes),
-        (
-            "curriculum",
-            ", ".join(f"{key}={value}" for key, value in options.items() if value is not None),
-        ),
-        ("seeds", seeds),
-        (
-            "trained",
-            f"{spent}, {history.arena_steps[-1]:,} arena control steps per seed, "
-            f"{words.count(trained.arenas, 'arena')}{time}",
-        ),
         ("last stage", _last_stage(history)),
+        ("trained", f"{spent}, {steps}, {words.count(trained.arenas, 'arena')}{time}"),
+        *(stages if len(names) > 1 else []),
+        ("seeds", f"{seeds[0]}" + (f" to {seeds[-1]}" if len(seeds) > 1 else "")),
         ("computed by", _origin(history.summary)),
     ]
+
+
+def replay(run: Path, out: Path | None = None) -> tuple[str, str]:
+    """Finds the replay of a run.
+
+    Args:
+      run: the run directory.
+      out: directory of the page that links to it; None: of a page that is in no directory.
+
+    Returns:
+      The address of the replay, and the command that writes it; empty where there is none.
+    """
+    film, policies = run / "replay.html", sorted(run.glob("policy*.npz"))
+    address = os.path.relpath(film, out) if out and film.exists() else ""
+    how = command.line("replay", f"policy={policies[0]}", f"out={film}") if policies else ""
+    return address, how
 
 
 def _last_stage(history: History) -> str:
@@ -91,7 +96,7 @@ def _last_stage(history: History) -> str:
     values = history.success[:, -1, -1]
     (mean,), (measured,) = report_rows.among(values[:, None])
     if not measured:
-        return "not measured, since no whole cohort has ended on it"
+        return "not measured: no full group of episodes has ended on it"
     text = f"{history.names[-1]}: {report_rows.measure(history)} {_percent(mean)}"
     if len(history.seeds) == 1:
         return text

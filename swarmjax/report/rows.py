@@ -46,24 +46,22 @@ def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
     return isinstance(value, types) and not isinstance(value, bool) and abs(value) <= largest
 
 
-WHOLE = ValueKind("whole number", lambda value: _is_number(value, int, 2**63 - 1))  # as NumPy holds
-COUNT = ValueKind("whole number", lambda value: WHOLE.fits(value) and value >= 0)
+# NumPy holds no larger ones.
+COUNT = ValueKind("whole number", lambda each: _is_number(each, int, 2**63 - 1) and each >= 0)
 NUMBER = ValueKind("number", lambda value: _is_number(value, int | float, _LARGEST))
 NUMBER_OR_NULL = ValueKind("number", lambda value: value is None or NUMBER.fits(value))
 NAME = ValueKind("name", lambda value: isinstance(value, str))
-FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
 MAP = ValueKind("keys and values", lambda value: isinstance(value, dict))
+FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
 
 
 def list_of(kind: ValueKind, count: int) -> ValueKind:
     """Makes the kind of a list with this many values of a kind, at least one."""
-    name = f"list of {count} {kind.name}s"
-    return ValueKind(
-        name,
-        lambda value: (
-            isinstance(value, list) and len(value) == count > 0 and all(map(kind.fits, value))
-        ),
-    )
+
+    def fits(value: Any) -> bool:
+        return isinstance(value, list) and len(value) == count > 0 and all(map(kind.fits, value))
+
+    return ValueKind(f"list of {count} {kind.name}s", fits)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -165,7 +163,7 @@ def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
     """
     by_seed: dict[int, dict[int, Row]] = {}
     for where, row in read_lines(run, METRICS):
-        check(row, ("seed", "update", "arena_steps"), WHOLE, where)
+        check(row, ("seed", "update", "arena_steps"), COUNT, where)
         own = [name for name in row if name.startswith(MEASURED)][:1]
         names = (*CURVES, *own)
         check(row, ("train_s", *names), NUMBER_OR_NULL, where)
@@ -187,7 +185,7 @@ def shared_stages(histories: Sequence[History]) -> list[str]:
 
 def measure(history: History) -> str:
     """Names the quantity in `success`, which the curriculum uses for its decisions."""
-    by_targets = history.config.curriculum.success == "targets"
+    by_targets = history.decided_by == "success_by_stage"
     return "targets reached" if by_targets else "episodes in which all arrived"
 
 
@@ -263,7 +261,7 @@ def _read_decisions(run: Path) -> list[Row]:
     """Reads the decisions of the curriculum, sorted by seed and update."""
     decisions = []
     for where, row in read_lines(run, DECISIONS):
-        check(row, ("seed", "update"), WHOLE, where)
+        check(row, ("seed", "update"), COUNT, where)
         check(row, ("targets_reached", "all_reached"), NUMBER_OR_NULL, where)
         decisions.append(row)
     return sorted(decisions, key=lambda row: (row["seed"], row["update"]))

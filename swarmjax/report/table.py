@@ -4,9 +4,11 @@ A line may hold one run with several seeds, or several runs with one or more see
 of an array write them. Success is the last stage's newest verdict.
 """
 
+import itertools
 import json
 import math
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +25,8 @@ from swarmjax.run.settings import TrainConfig
 
 # Runs on one line may differ in these settings: which seeds they have, and how they ran.
 _APART = ("seed", "seeds", "seeds_by", "devices", "streams", "resume", "run")
-HEADS = ("runs", "settings", "last stage", "updates", "seeds", "success", "95 %", "train (s)")
+HEADS = ("settings", "stage", "updates", "seeds", "success", "95 %", "train (s)", "runs")
+_WIDTH = 100  # characters of a line on the terminal
 
 
 class TableLine(NamedTuple):
@@ -109,6 +112,7 @@ def read(runs: Sequence[Path]) -> list[Group]:
         history = rows.read(run)
         shared = {k: v for k, v in to_dict(history.config).items() if k not in _APART}
         shared["run"] = {"stop_at": history.config.run.stop_at}  # a run that stops early differs
+        shared["stage"] = {stage["name"]: stage for stage in shared["stage"]}
         groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
     return [
@@ -166,15 +170,18 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
 
 
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
-    """Writes the settings that differ between lines, without settings that follow from others."""
-    derived = {*keys(TrainConfig, derived=True), "stage"}
-    differing = [
-        key
-        for key, value in mine.items()
-        if key not in derived - {"stage_name"} and any(other.get(key) != value for other in every)
-    ]
-    words = (f"{key.removesuffix('_name')}={show(mine[key], quote='')}" for key in differing)
-    return " ".join(words)
+    """Writes the settings that differ between lines, without settings that follow from others.
+
+    Stages of one name are compared setting by setting. An own piece is written without its digest.
+    """
+    derived, written = keys(TrainConfig, derived=True).keys() - {"stage_name"}, []
+    for key, value in mine.items():
+        missing = value if key.startswith("stage.") else None  # `stage=` names the stages
+        if key not in derived and any(other.get(key, missing) != value for other in every):
+            piece = key.removeprefix("pieces.").replace(".", "=", 1)
+            text = f"{key.removesuffix('_name')}={show(value, quote='')}"
+            written.append(piece if key.startswith("pieces.") else text)
+    return " ".join(written)
 
 
 def cells(line: TableLine) -> tuple[str, ...]:
@@ -183,7 +190,6 @@ def cells(line: TableLine) -> tuple[str, ...]:
     folder = os.path.commonpath(map(os.path.abspath, line.runs))
     seeds, unmeasured = len(line.seeds), line.success.count(None)
     return (
-        first if count == 1 else f"{count} in {folder}",
         line.settings or "-",
         line.stage,
         f"{line.updates:,} of {line.budget:,}",
@@ -191,20 +197,28 @@ def cells(line: TableLine) -> tuple[str, ...]:
         "-" if line.mean is None else f"{100.0 * line.mean:.1f} %",
         "-" if line.interval is None else "{:.1%} to {:.1%}".format(*line.interval),
         "-" if line.train_s is None else f"{line.train_s:,.1f}",
+        first if count == 1 else f"{count} in {folder}",
     )
 
 
 def text(lines: Sequence[TableLine]) -> str:
     """Writes lines as a table for a terminal, with a note about success and its interval."""
     table = [HEADS, *map(cells, lines)]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    written = (
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in table
-    )
+    columns = list(zip(*table, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    # The settings go onto several lines first. A word is cut only if that does not suffice.
+    least = [max(map(len, " ".join(columns[0]).split())), *widths[1:]]
+    while sum(widths) > _WIDTH - 2 * (len(widths) - 1):
+        at = max(range(len(widths)), key=lambda i: (max(widths[i] - least[i], 0), widths[i]))
+        widths[at] -= 1
+    written = []
+    for row in table:
+        wrapped = [textwrap.wrap(cell, width) for cell, width in zip(row, widths, strict=True)]
+        for parts in itertools.zip_longest(*wrapped, fillvalue=""):
+            written.append("  ".join(map(str.ljust, parts, widths)).rstrip())
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
-        f"Success: {measures} on the last stage, in its newest whole cohort; mean over seeds and "
-        f"95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
+        f"Success: {measures} on the last stage, in its newest full group of episodes; mean over "
+        f"seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
     )
-    return "\n".join([*written, note])
+    return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])

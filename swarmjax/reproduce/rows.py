@@ -176,7 +176,7 @@ def read_rows(out: Path) -> list[Row]:
         raise ConfigError(f"{path} has no list of rows: remove it to judge again.")
     for number, row in enumerate(rows, 1):
         where = f"{path}, row {number},"
-        report_rows.check(row, ("seed",), report_rows.WHOLE, where)
+        report_rows.check(row, ("seed",), report_rows.COUNT, where)
         report_rows.check(row, ("arm", "stage", "action"), report_rows.NAME, where)
         report_rows.check(row, JUDGED, report_rows.NUMBER, where)
     return rows
@@ -197,7 +197,7 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     """Reads the episodes of an arm, by seed."""
     by_seed: dict[int, list[Row]] = {seed: [] for seed in seeds}
     for where, row in report_rows.read_lines(run, EPISODES):
-        report_rows.check(row, ("seed", "arena_steps", "robots"), report_rows.WHOLE, where)
+        report_rows.check(row, ("seed", "arena_steps", "robots"), report_rows.COUNT, where)
         report_rows.check(row, ("stage",), report_rows.NAME, where)
         for key, kind in _BY_ROBOT.items():
             report_rows.check(row, (key,), report_rows.list_of(kind, row["robots"]), where)

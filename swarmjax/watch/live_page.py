@@ -16,7 +16,7 @@ from swarmjax.watch import status
 
 # Drawing takes at most this share of a core, so that it hardly slows down the run.
 SHARE = 0.2
-_TEMPLATE, _STYLES = "watch/watch.html", (*report_page.STYLES, "watch/watch.css")
+_TEMPLATE = "watch/watch.html"
 
 
 class LivePage:
@@ -40,7 +40,7 @@ class LivePage:
         self.history: History | None = None
         self.figures: dict[str, bytes] = {}
         self.trouble = ""
-        self._drawn: tuple[int, float] | None = None
+        self._drawn = 0  # bytes of METRICS; a run only adds to it
         self._rests_until = 0.0
         self._lock = threading.Lock()  # two browsers may ask at once
 
@@ -50,17 +50,18 @@ class LivePage:
             self._draw()
             state, sentence = status.read(self.run, self.trained, self.history)
             about: dict[str, Any] = {"state": state, "sentence": sentence, "trouble": self.trouble}
-            about |= {"styles": _STYLES, "has_trained": self.history is not None}
-            title = f"Watching {self.run}"
+            about |= {"title": f"Watching {self.run}", "has_trained": self.history is not None}
             if self.history is None:
-                return builder.render(_TEMPLATE, title=title, **about)
-            made_by = command.line("watch", f"run={self.run}")
-            return report_page.page(title, made_by, self.history, self.figures, _TEMPLATE, **about)
+                return builder.render(_TEMPLATE, styles=report_page.STYLES, **about)
+            about |= {"template": _TEMPLATE, "replay": report_page.replay(self.run)}
+            about["command"] = command.line("watch", f"run={self.run}")
+            return report_page.page(history=self.history, figures=self.figures, **about)
 
     def _draw(self) -> None:
         """Draws the figures if the run has logged more, unless drawing must rest."""
-        version, began = _version(self.run / METRICS), time.monotonic()
-        if version in (None, self._drawn) or began < self._rests_until:
+        metrics, began = self.run / METRICS, time.monotonic()
+        written = metrics.stat().st_size if metrics.exists() else 0
+        if written in (0, self._drawn) or began < self._rests_until:
             return
         from swarmjax.report import figures  # Matplotlib takes a second
 
@@ -70,13 +71,4 @@ class LivePage:
         except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
             self.trouble = str(error)
         now = time.monotonic()
-        self._drawn, self._rests_until = version, now + (now - began) * (1.0 - SHARE) / SHARE
-
-
-def _version(path: Path) -> tuple[int, float] | None:
-    """Returns a file's size and time, to detect changes; None if it is missing or empty."""
-    try:
-        file = path.stat()
-    except OSError:
-        return None
-    return (file.st_size, file.st_mtime) if file.st_size else None
+        self._drawn, self._rests_until = written, now + (now - began) * (1.0 - SHARE) / SHARE

@@ -37,10 +37,9 @@ def read(run: Path, trained: TrainConfig, history: History | None) -> RunStatus:
             seconds = history.seconds / done * (trained.updates - done)
             left = f", about {words.duration(round(seconds))} left"
         return RunStatus("trains", f"It trains: {so_far} done{left}.")
-    if done >= trained.updates:
-        return RunStatus("ended", f"It has ended: {so_far} done.")
-    if history is not None and history.has_reached:
-        return RunStatus("ended", f"It has ended: {so_far} done, run.stop_at is reached.")
+    why = ", run.stop_at is reached" if history is not None and history.has_reached else ""
+    if why or done >= trained.updates:
+        return RunStatus("ended", f"It has ended: {so_far} done{why}.")
     resume = command.line("train", f"resume={run}")
     return RunStatus("stopped", f"It has stopped after {so_far}. Go on with: {resume}")
 

@@ -38,7 +38,7 @@ def _wide_row(success: list[float | None], **given: object) -> dict:
 
 def _lines(panel: Axes, colour: str, style: str) -> list[np.ndarray]:
     """Returns the curves [points, 2] of one colour and style, without undrawn points."""
-    found = [line for line in panel.lines if line.get_color() == colour]
+    found = [line for line in panel.lines if np.array_equal(line.get_color(), colour)]
     points = [np.asarray(line.get_xydata()) for line in found if line.get_linestyle() == style]
     return [each[~np.isnan(each[:, 1])] for each in points]
 
@@ -85,7 +85,7 @@ def test_success_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> 
     shares = [0.1, 0.2, 0.4, 0.9]
     rows = [row(0, seed, success_by_stage=[share, None]) for seed, share in enumerate(shares)]
     rows += [row(1, seed, success_by_stage=[0.5, 0.25 if seed else None]) for seed in range(4)]
-    figure = report_figures.success(_history(tmp_path, rows))
+    figure = report_figures.stages(_history(tmp_path, rows))
     pair, trio = figure.axes
     [bold] = _lines(pair, BOLD, "-")
     # The interquartile mean of four is the mean of the middle two. Rows hold float32.
@@ -98,30 +98,44 @@ def test_success_has_every_seed_and_their_interquartile_mean(tmp_path: Path) -> 
     assert trio.get_title(loc="left") == "trio   25 %"
 
 
-@pytest.mark.parametrize(("stages", "promotes"), [(2, True), (1, False)])
-def test_the_share_that_promotes_is_drawn_where_something_does(
-    stages: int, promotes: bool, tmp_path: Path
-) -> None:
-    history = _history(tmp_path, [_wide_row([0.5] * stages)], CONFIG.stage[:stages])
-    figure = report_figures.success(history)
-    drawn = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
-    assert [np.asarray(line.get_ydata()).tolist() for line in drawn] == [[0.8, 0.8]] * promotes
+def test_the_share_that_promotes_is_drawn(tmp_path: Path) -> None:
+    figure = report_figures.stages(_history(tmp_path, [_wide_row([0.5] * 2)]))
+    [drawn] = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert np.asarray(drawn.get_ydata()).tolist() == [0.8, 0.8]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["seed 0"] + ["promotes"] * promotes
+    assert labels == ["seed 0", "promotes"]
+
+
+def test_the_learning_curve_has_the_last_stage_and_those_before_it(tmp_path: Path) -> None:
+    rows = [row(i, success_by_stage=[0.75, share]) for i, share in enumerate([0.25, 0.5])]
+    figure = report_figures.success(_history(tmp_path, rows))
+    [panel] = figure.axes
+    [bold] = _lines(panel, BOLD, "-")
+    assert bold.tolist() == [[64, 0.25], [128, 0.5]]
+    assert np.asarray(panel.lines[0].get_ydata()).tolist() == [0.75, 0.75]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["seed 0", "pair"]
+
+
+def test_the_learning_curve_of_a_single_stage_is_its_own(tmp_path: Path) -> None:
+    rows = [_wide_row([0.5], **{"seed": seed}) for seed in range(2)]
+    figure = report_figures.success(_history(tmp_path, rows, CONFIG.stage[:1]))
+    assert len(figure.axes[0].lines) == 3
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["interquartile mean of 2 seeds", "each seed"]
 
 
 def test_each_panel_shows_the_threshold_of_its_stage(tmp_path: Path) -> None:
     history = _history(tmp_path, [_wide_row([0.5] * 2)])
     options = replace(history.config.curriculum, threshold=(0.9, 0.7))
     config = replace(history.config, curriculum=options)
-    figure = report_figures.success(replace(history, config=config))
+    figure = report_figures.stages(replace(history, config=config))
     shown = [_lines(panel, LIMIT, "--")[0][0, 1] for panel in figure.axes[:2]]
     assert shown == [0.9, 0.7]
 
 
 def test_a_panel_for_each_of_many_stages(tmp_path: Path) -> None:
     stages = _stages([(2, 0, 0.5 + 0.01 * i) for i in range(34)])
-    figure = report_figures.success(_history(tmp_path, [_wide_row([0.5] * 34)], stages))
+    figure = report_figures.stages(_history(tmp_path, [_wide_row([0.5] * 34)], stages))
     shown = [panel for panel in figure.axes if panel.get_visible()]
     titles = [panel.get_title(loc="left").split()[0] for panel in shown]
     assert titles == [stage.name for stage in stages]
@@ -153,6 +167,22 @@ def test_a_curve_leaves_out_what_was_not_measured(tmp_path: Path) -> None:
     assert bold.tolist() == [[128, 0.5], [256, 0.25]]
 
 
+def test_a_curve_is_a_line_over_updates_without_a_value(tmp_path: Path) -> None:
+    rows = [row(i, entropy=None if i % 2 else 0.5) for i in range(5)]
+    panel = _panel(_history(tmp_path, rows), "entropy of the policy")
+    assert np.asarray(panel.lines[-1].get_xydata()).tolist() == [[64, 0.5], [192, 0.5], [320, 0.5]]
+
+
+def test_a_single_value_is_a_dot(tmp_path: Path) -> None:
+    panel = _panel(_history(tmp_path, [row(0, entropy=0.5), row(1)]), "entropy of the policy")
+    assert panel.lines[-1].get_marker() == "o"
+
+
+def test_a_run_of_one_stage_has_no_figures_of_a_curriculum(tmp_path: Path) -> None:
+    history = _history(tmp_path, [_wide_row([0.5])], CONFIG.stage[:1])
+    assert list(report_figures.png_files(history)) == ["success"]
+
+
 def test_a_long_curve_is_averaged_and_nothing_is_left_out(tmp_path: Path) -> None:
     rows = [row(i, entropy=10.0 if i == 777 else 0.0) for i in range(2000)]
     [bold] = _lines(_panel(_history(tmp_path, rows), "entropy of the policy"), BOLD, "-")
@@ -168,7 +198,7 @@ def test_files_are_png_and_the_same_again(tmp_path: Path) -> None:
     wide = _wide_row([0.1, 0.2, None, 0.4, 0.5], entropy=1.0)
     history = _history(tmp_path, [wide], _stages([(2, 0, 0.5 + 0.1 * i) for i in range(5)]))
     files = report_figures.png_files(history)
-    assert list(files) == ["mix", "success", "curves"]
+    assert list(files) == ["success", "stages", "mix", "curves"]
     assert all(content.startswith(b"\x89PNG\r\n") for content in files.values())
     assert not any(b"Matplotlib" in content for content in files.values())
     assert report_figures.png_files(history) == files

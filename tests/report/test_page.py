@@ -6,14 +6,14 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
-from runs import row, write
+from runs import CONFIG, row, write
 
 from swarmjax.report import page as report_page
 from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.run.settings import RunConfig
 
-FIGURES = {"mix": b"\x89PNG-mix", "success": b"\x89PNG-success"}
+FIGURES = {"success": b"\x89PNG-success", "mix": b"\x89PNG-mix"}
 
 
 class Page(HTMLParser):
@@ -83,11 +83,48 @@ def test_the_summary_says_that_a_run_stopped_at_its_success(tmp_path: Path) -> N
 def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
     history = replace(_history(tmp_path, [row(0)]), seconds=None)
     page = _page(history)
-    unmeasured = "not measured, since no whole cohort has ended on it"
+    unmeasured = "not measured: no full group of episodes has ended on it"
     assert page.fact("last stage") == unmeasured
     assert page.fact("Promotions") == "None. The shares of the stages changed 0 times."
     assert "min" not in page.fact("trained")
     assert ["pair", "2", "any", "0", "0.5", "100.0 %", "-", "-", "-", "-", "0 of 1"] in page.rows
+
+
+def test_the_settings_come_last(tmp_path: Path) -> None:
+    words = _page(_history(tmp_path, [row(0)])).words
+    parts = ["last stage", "Promotions", "Stages", "Settings", "curriculum", "made by"]
+    assert [each for each in words if each in parts] == parts
+
+
+def test_the_learning_curve_comes_first(tmp_path: Path) -> None:
+    tags = [tag for tag, _ in _page(_history(tmp_path, [row(0)])).tags]
+    assert tags.index("figure") < tags.index("dl")
+
+
+def test_a_run_of_one_stage_has_no_curriculum(tmp_path: Path) -> None:
+    short = {key: value[:1] for key, value in row(0).items() if isinstance(value, list)}
+    trained = replace(CONFIG, stage=CONFIG.stage[:1], stage_name="")
+    run = write(tmp_path, [row(0) | short], trained=trained)
+    words = _page(report_rows.read(run)).words
+    assert not {"Promotions", "stages", "curriculum"} & set(words)
+
+
+def test_a_replay_is_linked_from_the_folder_of_the_report(tmp_path: Path) -> None:
+    run = write(tmp_path / "a #1", [row(0)])
+    (run / "replay.html").touch()
+    found = report_page.replay(run, tmp_path / "reports")
+    assert found == ("../a #1/replay.html", "")
+    text = report_page.page("a run", "make it", report_rows.read(run), FIGURES, found)
+    assert ("a", {"href": "../a%20%231/replay.html"}) in Page(text).tags
+
+
+def test_without_a_replay_its_command_is_given(tmp_path: Path) -> None:
+    history = _history(tmp_path, [row(0)])
+    (tmp_path / "policy.npz").touch()
+    found = report_page.replay(tmp_path, tmp_path)
+    how = f"python -m swarmjax.replay policy={tmp_path}/policy.npz out={tmp_path}/replay.html"
+    assert found == ("", how)
+    assert how in Page(report_page.page("a run", "make it", history, FIGURES, found)).words
 
 
 def test_a_single_seed_has_no_range(tmp_path: Path) -> None:

@@ -25,11 +25,20 @@ def test_a_report_is_written_beside_its_run(
     run = write(tmp_path / "a 'run'", [row(0)])
     assert _run(monkeypatch, f"run={str(run)!r}") == 0
     out = run / "report"
-    assert set(directory.visible(out)) == {"mix.png", "success.png", "report.html"}
+    assert set(directory.visible(out)) == {"success.png", "stages.png", "mix.png", "report.html"}
     page = (out / "report.html").read_text()
     assert f"<h1>Report of {tmp_path}/a &#39;run&#39;</h1>" in page
     assert "<code>python -m swarmjax.report &#39;run=" in page
     assert str(out / "report.html") in capsys.readouterr().out
+
+
+def test_a_report_links_to_the_replay_of_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = write(tmp_path, [row(0)])
+    (run / "replay.html").touch()
+    assert _run(monkeypatch, f"run={run}") == 0
+    assert '<a href="../replay.html">' in (run / "report" / "report.html").read_text()
 
 
 def test_a_report_is_written_where_it_is_wanted(

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from runs import CONFIG, row, write
 
+from swarmjax.config.section import ByName
 from swarmjax.report import __main__ as report
 from swarmjax.report import table
 from swarmjax.run.settings import RunConfig, TrainConfig
@@ -66,7 +67,7 @@ def test_jobs_given_by_relative_and_absolute_paths_are_one_line(
     _array(tmp_path, [[0.5], [0.6]])
     monkeypatch.chdir(tmp_path)
     (line,) = _lines(table.find(f"0,{tmp_path}/1"))
-    assert table.cells(line)[0] == f"2 in {tmp_path}"
+    assert table.cells(line)[-1] == f"2 in {tmp_path}"
 
 
 def test_cells_of_a_sweep_are_a_line_each(tmp_path: Path) -> None:
@@ -122,7 +123,7 @@ def test_a_seed_that_was_not_measured_has_no_part_in_the_mean(tmp_path: Path) ->
     (line,) = _lines([write(tmp_path, _rows(0.5, None, 0.7))])
     assert line.mean == pytest.approx(0.6)
     assert line.interval is None
-    assert table.cells(line)[4] == "3, 2 measured"
+    assert table.cells(line)[3] == "3, 2 measured"
     (none,) = _lines([write(tmp_path, _rows(None))])
     assert (none.mean, none.success) == (None, [None])
 
@@ -140,6 +141,38 @@ def test_the_command_prints_the_table(tmp_path: Path, capsys: pytest.CaptureFixt
     folder = _array(tmp_path / "mine", [[0.5, 0.6], [0.7, 0.8]])
     assert report.main([f"runs={folder}"]) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert printed[0].split()[:3] == ["runs", "settings", "last"]
-    assert printed[1].startswith(f"2 in {folder}")
-    assert "65.0 %" in printed[1]
+    assert printed[0].split()[:3] == ["settings", "stage", "updates"]
+    assert "  65.0 %  " in printed[1]
+
+
+def test_a_printed_line_has_at_most_100_characters(tmp_path: Path) -> None:
+    wide = dataclasses.replace(
+        MORE, budget=10**9, algo=dataclasses.replace(MORE.algo, clip_epsilon=0.3)
+    )
+    for folder, trained in {"a" * 150: CONFIG, "b" * 150: wide}.items():
+        write(tmp_path / folder, _rows(0.5), trained=trained)
+    printed = table.text(_lines(table.find(str(tmp_path)))).splitlines()
+    assert max(map(len, printed)) <= 100
+
+
+def test_a_word_is_not_cut_where_there_is_room(tmp_path: Path) -> None:
+    (line,) = _lines([write(tmp_path, _rows(0.5))])
+    words = ["algo.actor_learning_rate=0.001", "budget=300000", "stage=curriculum"]
+    printed = table.text([line._replace(settings=" ".join(words), runs=["/tmp/somewhere/a"])])
+    assert set(words) <= set(printed.split())
+
+
+def test_own_code_is_named_without_its_digest(tmp_path: Path) -> None:
+    own = dataclasses.replace(CONFIG, pieces=ByName({"reward": ByName({"mine": "0" * 64})}))
+    runs = [write(tmp_path / "a", _rows(0.5)), write(tmp_path / "b", _rows(0.5), trained=own)]
+    assert [line.settings for line in _lines(runs)] == ["", "reward=mine"]
+
+
+def test_stages_of_one_name_are_told_apart_by_their_settings(tmp_path: Path) -> None:
+    wide = (CONFIG.stage[0], dataclasses.replace(CONFIG.stage[1], side=0.9))
+    other = dataclasses.replace(CONFIG, stage=wide)
+    runs = [write(tmp_path / "a", _rows(0.5)), write(tmp_path / "b", _rows(0.5), trained=other)]
+    assert [line.settings for line in _lines(runs)] == [
+        "stage.trio.side=0.8",
+        "stage.trio.side=0.9",
+    ]

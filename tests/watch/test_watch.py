@@ -122,6 +122,20 @@ def test_a_run_without_an_update_has_a_page(tmp_path: Path) -> None:
     assert "It has stopped after 0 of 20 updates." in page.html()
 
 
+def test_a_run_of_one_stage_has_no_panel_of_a_curriculum(tmp_path: Path) -> None:
+    short = {key: value[:1] for key, value in row(0).items() if isinstance(value, list)}
+    trained = replace(CONFIG, stage=CONFIG.stage[:1], stage_name="")
+    page = LivePage(write(tmp_path / "run", [row(0) | short], trained=trained)).html()
+    assert 'id="success"' in page
+    assert 'id="mix"' not in page
+
+
+def test_the_page_says_how_to_see_the_robots(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", [row(0)])
+    (run / "policy.npz").touch()
+    assert f"<code>python -m swarmjax.replay policy={run}/policy.npz" in LivePage(run).html()
+
+
 def test_figures_are_drawn_anew_when_there_is_more_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
