@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
-    "code lines of swarmjax": 19_124,
+    "code lines of swarmjax": 19_163,
     "code lines of benchmarks": 4_500,
     "keys of train": 140,
     "longest file": 450,

@@ -38,15 +38,19 @@ def result(
     Returns:
       The result; docs/interface.md lists it.
     """
-    about = [[{"path": path, "digest": trained.digest} for path, trained in each] for each in sides]
+    who = [[{"path": path, "digest": trained.digest} for path, trained in each] for each in sides]
     is_one = len(sides) == 1
     own = {name: measure._asdict() for name, measure in trials[0].own.items()}
     return {
-        **_about(config, suite),
+        **about(config, suite),
         **({"own_measures": own} if own else {}),
-        **({"policies": about[0]} if is_one else {"compared": about}),
+        **({"policies": who[0]} if is_one else {"compared": who}),
         "cells": [
-            about_cell(config, trial) | {"measures": _figures([trial], is_one=is_one)}
+            {
+                **about_cell(config, trial.cell),
+                "unreachable": int(np.isinf(trial.shortest).any(axis=-1).sum()),
+                "measures": _figures([trial], is_one=is_one),
+            }
             for trial in trials
         ],
         "pooled": _pool(trials, is_one=is_one),
@@ -69,7 +73,13 @@ def _figures(
     return compare(a, b, strata, about)
 
 
-def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
+def about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
+    """Describes under which settings an evaluation runs, as plain data for JSON.
+
+    Args:
+      config: Settings of the evaluation.
+      suite: Its name, or None.
+    """
     return {
         "suite": suite,
         "engine": config.engine,
@@ -82,17 +92,17 @@ def _about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
     }
 
 
-def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
-    """Describes the levels of a trial, and counts the levels that no robot could solve.
+def about_cell(config: EvaluateConfig, cell: Cell) -> dict[str, Any]:
+    """Describes the levels of a cell, and the settings that it has for itself.
 
     Args:
       config: Settings of the evaluation.
-      trial: Trial on one cell.
+      cell: The cell.
 
     Returns:
       Plain data for JSON.
     """
-    cell, mine = trial.cell, specialise(config, trial.cell)
+    mine = specialise(config, cell)
     return {
         "cell": cell.name,
         "stage": to_dict(cell.stage),
@@ -102,7 +112,6 @@ def about_cell(config: EvaluateConfig, trial: Trial) -> dict[str, Any]:
         "steps": mine.step_limit,
         "seed": cell.seed,
         "digest": cell.digest,
-        "unreachable": int(np.isinf(trial.shortest).any(axis=-1).sum()),
     }
 
 

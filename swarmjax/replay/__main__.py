@@ -59,8 +59,8 @@ def main(arguments: Sequence[str]) -> int:
             report = partial(progress.advance, bar)
             replay_video.write(video, settings, episodes, report)
     sys.stdout.write(f"swarmjax.replay: {said}\n")
-    labels = "; ".join(episode.label for episode in episodes)
-    sys.stdout.write(f"{out}: {labels}; {len(page) / 1e6:.2f} MB.\n")
+    sys.stdout.writelines(f"{episode.label}\n" for episode in episodes)
+    sys.stdout.write(f"{out}: {len(page) / 1e6:.2f} MB.\n")
     if video:
         sys.stdout.write(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.\n")
     return 0

@@ -7,15 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import Progress
 
+from swarmjax import words
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import cells
 from swarmjax.evaluate import judge as evaluate_judge
 from swarmjax.evaluate import trials as evaluate_trials
-from swarmjax.evaluate.cells import Cell
+from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.trials import Entrant, Trial
-from swarmjax.replay import record
+from swarmjax.replay import judged, record
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.record import ReplayEpisode
+from swarmjax.replay.record import Recording, ReplayEpisode
+from swarmjax.task.config import TaskConfig
 
 
 class Pick(NamedTuple):
@@ -33,7 +35,7 @@ def replay(
     Args:
       settings: The replay's settings.
       entrants: The policies that drive.
-      progress: Shows the progress.
+      progress: Shows the progress, and whether an evaluation is used.
 
     Returns:
       The recordings of each level, in the order in which the levels were named, or the worst
@@ -43,27 +45,35 @@ def replay(
       PolicyError: If a policy does not fit a level's stage.
       ConfigError: If there are too few levels, or the physics breaks down.
     """
-    judged = settings.evaluation
     if settings.worst is None:
-        chosen = [cells.draw_stage(judged, settings.levels)]
+        suite = Suite(None, (cells.draw_stage(settings.evaluation, settings.levels),))
     else:
-        chosen = list(cells.load(judged).cells)
-    for cell in chosen:
+        suite = cells.load(settings.evaluation)
+    for cell in suite.cells:
         for each in entrants:
-            evaluate_judge.check_policy(judged, cell.stage, *each)
+            evaluate_judge.check_policy(settings.evaluation, cell.stage, *each)
+    count = sum(len(cell.episodes) for cell in suite.cells)
     if settings.worst is None:
-        picks = [Pick(0, row) for row in range(len(settings.levels))]
+        picks = [Pick(0, row) for row in range(count)]
+    elif settings.worst > count:
+        raise ConfigError(f"worst is {settings.worst}: give 1 to {count}, the levels there are.")
     else:
-        count = sum(len(cell.episodes) for cell in chosen)
-        if settings.worst > count:
-            raise ConfigError(
-                f"worst is {settings.worst}: give 1 to {count}, the levels there are."
-            )
-        report = partial(progress.advance, progress.add_task("episodes", total=count))
-        picks = worst(
-            list(evaluate_trials.run(judged, chosen, entrants[:1], report)), settings.worst
-        )
-    return _record(settings, entrants, chosen, picks)
+        picks = worst(_judge(settings, entrants[0], suite, count, progress), settings.worst)
+    return _record(settings, entrants, suite, picks)
+
+
+def _judge(
+    settings: ReplayConfig, entrant: Entrant, suite: Suite, count: int, progress: Progress
+) -> list[Trial]:
+    """Takes a policy's results on all `count` levels from an evaluation, or judges the policy."""
+    say = partial(progress.print, markup=False, highlight=False, soft_wrap=True)
+    episodes, found = words.count(count, "episode"), judged.find(settings, entrant, suite)
+    if found:
+        say(f"Takes the results of {episodes} from {found[0]}, where evaluate stored them.")
+        return found[1]
+    say(f"Judges {episodes}: found no such evaluation beside the policy or the page.")
+    report = partial(progress.advance, progress.add_task("episodes", total=count))
+    return list(evaluate_trials.run(settings.evaluation, suite.cells, [entrant], report))
 
 
 def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
@@ -79,30 +89,40 @@ def worst(trials: Sequence[Trial], count: int) -> list[Pick]:
     """
     picks = [Pick(i, j) for i, each in enumerate(trials) for j in range(len(each.cell.episodes))]
     reached, contacts, time = (
-        np.concatenate([each.measures[name][0] for each in trials])
-        for name in ("targets_reached", "contacts_per_robot", "episode_time_s")
+        np.concatenate([each.measures[name][0] for each in trials]) for name in judged.RANKED
     )
     return [picks[i] for i in np.lexsort([-time, -contacts, reached])[:count]]
 
 
 def _record(
-    settings: ReplayConfig,
-    entrants: Sequence[Entrant],
-    chosen: Sequence[Cell],
-    picks: Sequence[Pick],
+    settings: ReplayConfig, entrants: Sequence[Entrant], suite: Suite, picks: Sequence[Pick]
 ) -> list[ReplayEpisode]:
     """Records episodes; those of one cell run side by side."""
     recorded = {}
     for i in sorted({pick.cell for pick in picks}):
-        cell, mine = chosen[i], [pick for pick in picks if pick.cell == i]
+        cell, mine = suite.cells[i], [pick for pick in picks if pick.cell == i]
         levels = cells.split(cell.levels)
         runs = []
         for each in entrants:
-            judged = evaluate_trials.specialise(settings.evaluation, cell)
-            judge = evaluate_judge.load(judged, each.policy, cell.half)
+            config = evaluate_trials.specialise(settings.evaluation, cell)
+            judge = evaluate_judge.load(config, each.policy, cell.half)
             runs.append(record.record(judge, [levels[pick.row] for pick in mine]))
         for pick, by_policy in zip(mine, zip(*runs, strict=True), strict=True):
             number = int(cell.episodes[pick.row])
-            label = f"level {number}" if len(chosen) == 1 else f"{cell.name}, level {number}"
-            recorded[pick] = ReplayEpisode(label, number, list(by_policy))
+            name = f"Episode {number} of {cell.name}: {outcome(by_policy, settings.task)}"
+            recorded[pick] = ReplayEpisode(name, number, list(by_policy))
     return [recorded[pick] for pick in picks]
+
+
+def outcome(runs: Sequence[Recording], task: TaskConfig) -> str:
+    """Says how an episode ended: `4 of 5 robots arrived, 12.3 s`; `3 and 4 of 5` of two policies.
+
+    Args:
+      runs: The level's recordings, one a policy.
+      task: Its control step and `arrival` matter.
+    """
+    there = " and ".join(str(run.arrived[-1].sum()) for run in runs)
+    robots = words.count(runs[0].arrived.shape[1], "robot")
+    end = "arrived" if task.arrival == "latch" else "within their targets"
+    times = " and ".join(f"{(len(run.pose) - 1) * task.control_step:.1f}" for run in runs)
+    return f"{there} of {robots} {end}, {times} s"

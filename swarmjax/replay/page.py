@@ -11,8 +11,7 @@ from swarmjax.replay.record import ReplayEpisode
 from swarmjax.sim import gaps
 from swarmjax.task.goals import load as goals
 
-_SOFTWARE = ("swarmjax", "mujoco", "numpy")  # what computed the episodes
-_SCRIPTS = ("replay/replay_data.js", "replay/replay_draw.js", "replay/replay.js")
+_SCRIPTS = tuple(f"replay/replay{part}.js" for part in ("_data", "_draw", "_gif", ""))
 
 
 def page(
@@ -36,7 +35,8 @@ def page(
     goal = goals.load(task, settings.robot, extension.load(settings.extensions).goals)
     header = {
         "policies": list(settings.policies),
-        "about": f"{_levels(settings)}, {settings.robot.body} robots, simulated by MuJoCo C",
+        "about": f"{settings.suite or settings.stage.name}, {settings.robot.body} robots, "
+        "simulated by MuJoCo C",
         "facts": _facts(settings, policies, words),
         "step": task.control_step,
         "kinds": list(gaps.KINDS),
@@ -48,14 +48,14 @@ def page(
         "measures": [[each.label, each.unit] for each in goal.measures.values()],
     }
     packed = pack.pack(header, episodes, settings.robot.sensor_range)
-    return fill(f"Replay of {' and '.join(settings.policies)} on {_levels(settings)}", packed)
+    return fill(episodes[0].label, packed)
 
 
 def fill(title: str, packed: bytes) -> str:
     """Puts title and data into the template.
 
     Args:
-      title: Title of the page.
+      title: Title of the page, until its script opens another episode.
       packed: The packed recordings, from `pack.pack`.
 
     Returns:
@@ -71,27 +71,19 @@ def fill(title: str, packed: bytes) -> str:
     )
 
 
-def _levels(settings: ReplayConfig) -> str:
-    """Names the stage or the suite of the levels."""
-    return settings.stage.name if settings.suite is None else settings.suite
-
-
 def _facts(settings: ReplayConfig, policies: Sequence[Policy], words: str) -> list[tuple[str, str]]:
     """States how the episodes were made, one fact per line."""
-    names = zip(settings.policies, policies, strict=True)
-    versions = provenance.versions()
+    names = ("policy",) if len(policies) == 1 else ("first policy", "second policy")
+    levels, versions = f"of {settings.suite or f'seed {settings.seed}'}", provenance.versions()
+    if settings.worst is not None:
+        levels = f"the {settings.worst} {levels} that went worst for the {names[0]}, worst first"
     return [
-        *((f"policy {name}", f"SHA-256 {trained.digest}") for name, trained in names),
-        ("levels", _choice(settings)),
+        *zip(names, (f"SHA-256 {each.digest}" for each in policies), strict=True),
+        ("levels", levels),
         ("time", f"control steps of {settings.task.control_step:g} s"),
-        ("versions", ", ".join(f"{name} {versions[name]}" for name in _SOFTWARE)),
+        (
+            "versions",
+            ", ".join(f"{name} {versions[name]}" for name in ("swarmjax", "mujoco", "numpy")),
+        ),
         ("made by", words),
     ]
-
-
-def _choice(settings: ReplayConfig) -> str:
-    """Writes which levels are shown."""
-    origin = f"of seed {settings.seed}" if settings.suite is None else f"of {_levels(settings)}"
-    if settings.worst is None:
-        return origin
-    return f"the {settings.worst} worst levels of {settings.policies[0]} {origin}, worst first"

@@ -88,7 +88,7 @@ class ReplayEpisode(NamedTuple):
     """The recordings of one level.
 
     Attributes:
-      label: Name of the level for people.
+      label: Title for people: the level, and how the episode ended.
       level: Number of the level.
       runs: One recording per policy.
     """
@@ -135,16 +135,11 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
         frames.append(_look(judge, arenas))
         over |= engine_c.is_over(judge, arenas.outcome)
     every = Frames(**{name: np.stack([each[name] for each in frames]) for name in frames[0]})
-    return [
-        _cut(
-            every.take(np.s_[:, i]),
-            level,
-            _scene(level, infrared.Mount(poses, None if yaw is None else yaw[i])),
-            judge,
-            earning,
-        )
-        for i, level in enumerate(levels)
-    ]
+    recordings = []
+    for i, level in enumerate(levels):
+        scene = _scene(level, infrared.Mount(poses, None if yaw is None else yaw[i]))
+        recordings.append(_cut(every.take(np.s_[:, i]), level, scene, judge, earning))
+    return recordings
 
 
 def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
@@ -166,11 +161,7 @@ def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
 
 
 def _cut(
-    frames: Frames,
-    level: Level,
-    scene: ReplayScene,
-    judge: Judge,
-    earning: RewardConfig,
+    frames: Frames, level: Level, scene: ReplayScene, judge: Judge, earning: RewardConfig
 ) -> Recording:
     """Makes the recording of one arena from its frames [N, ...], up to the end of its episode."""
     goal = judge.goal
@@ -192,14 +183,12 @@ def _cut(
     if earning.path_progress:
         path = _measure_paths(level, frames.pose, judge.config.robot.hull_radius)
         steps = steps._replace(path_before=path[:-1], path=path[1:])
-    earned = reward.weighted(steps, earning)
-    none = np.zeros_like(frames.distance[:1])
     return Recording(
         **vars(frames) | {"ray": np.minimum(frames.ray, judge.config.robot.sensor_range)},
         scene=scene,
         reward={
-            name: np.concatenate([none, np.where(goal.drives(before), term, 0.0)])
-            for name, term in earned.items()
+            name: np.pad(np.where(goal.drives(before), term, 0.0), ((1, 0), (0, 0)))
+            for name, term in reward.weighted(steps, earning).items()
         },
         arrival=_since(frames.arrived),
     )
@@ -229,8 +218,7 @@ def _since(arrived: np.ndarray) -> np.ndarray:
 
 def _scene(level: Level, mount: infrared.Mount) -> ReplayScene:
     """Records the fixed parts of an arena."""
-    at_origin = np.zeros((len(level.target), 3))
-    origin, toward = infrared.rays(at_origin, np, mount)
+    origin, toward = infrared.rays(np.zeros((len(level.target), 3)), np, mount)  # at the origin
     return ReplayScene(
         side=float(level.side),
         box=level.obstacle[level.obstacle_present].astype(float),

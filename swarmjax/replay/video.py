@@ -159,7 +159,6 @@ def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
         size = [settings.task.target_radius, _FLAT, 0.0]
         disc = _add(spec.worldbody, _CYLINDER, size, [x, y, _FLAT], [*colour[:3], 0.45])
         disc.name = f"target{i}"
-    for colour in colours:
         _add_robot(spec, settings.robot.hull_radius, colour)
     return spec
 

@@ -1,7 +1,10 @@
 """Tests the replay page in headless Chromium, opened from a file and without a network."""
 
+import base64
+import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +13,13 @@ import numpy as np
 import pytest
 import replays
 import steering
+from PIL import Image
 
 from swarmjax import policy_file
 from swarmjax.replay import pack as replay_pack
 from swarmjax.replay import page as replay_page
-from swarmjax.replay.record import Recording
+from swarmjax.replay.episodes import outcome
+from swarmjax.replay.record import Recording, ReplayEpisode
 
 pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
 from selenium.webdriver.common.action_chains import ActionChains
@@ -51,7 +56,7 @@ def file(tmp_path_factory: pytest.TempPathFactory, runs: list[list[Recording]]) 
     settings = load_levels(ReplayConfig, [f"policy={HOSTILE},ahead.npz", *WORDS])
     trained = policy_file.read(steering.write(folder / "steer.npz"))
     episodes = [
-        replays.episode(*each, level=level)
+        ReplayEpisode(f"Episode {level} of s6: {outcome(each, settings.task)}", level, each)
         for each, level in zip(runs, settings.levels, strict=True)
     ]
     path = folder / "replay.html"
@@ -304,7 +309,6 @@ def test_a_hostile_name_is_shown_as_it_is(browser, file):
     _open(browser, file)
     names = _js(browser, "[...document.querySelectorAll('h2')].map((each) => each.textContent)")
     assert names == [HOSTILE, "ahead.npz"]
-    assert HOSTILE in browser.title
     assert _js(browser, "document.scripts.length") == 2
 
 
@@ -322,6 +326,139 @@ def test_it_fits_and_is_drawn(browser, file, width, dark):
     assert (left[0] == left[1]) == (width < 760)  # stacked or side by side
     card = _js(browser, "getComputedStyle(document.body).backgroundColor")
     assert card == ("rgb(20, 21, 23)" if dark else "rgb(251, 251, 250)")
+
+
+def test_the_title_is_that_of_the_open_episode(browser, file):
+    _open(browser, file)
+    _js(browser, "replay.open(1)")
+    assert browser.title == "Episode 3 of s6: 1 and 0 of 3 robots arrived, 3.8 and 3.8 s"
+    assert _js(browser, "document.querySelector('h1').textContent") == browser.title
+
+
+def test_the_path_of_the_policy_is_shown_once(browser, file):
+    _open(browser, file)
+    browser.execute_script("document.querySelector('details').open = true")
+    assert _js(browser, "document.body.innerText").count(HOSTILE) == 1
+
+
+def test_walls_that_meet_leave_no_line_between_them(browser, runs, tmp_path):
+    path, names = tmp_path / "replay.html", ["policy=a.npz"]
+    trained = policy_file.read(steering.write(tmp_path / "steer.npz"))
+    # Edges that meet in the middle of a pixel or anywhere else in it, straight and turned.
+    yaw, half = 0.3, [0.0313, 0.1]
+    boxes = [
+        [0.0626 * i * np.cos(yaw) - 0.3, 0.0626 * i * np.sin(yaw), yaw, *half] for i in range(8)
+    ] + [[0.0626 * i - 0.2, -0.4, 0.0, *half] for i in range(8)]
+    scene = replace(runs[0][0].scene, box=np.array(boxes), side=1.2)
+    episodes = [replays.episode(replace(replays.wandering(1, 3), scene=scene))]
+    settings = load_levels(ReplayConfig, names)
+    path.write_text(replay_page.page(settings, [trained], episodes, "the command"))
+    _open(browser, path)
+    script = """
+      const canvas = document.querySelector(".arena");
+      const scale = Math.min(canvas.clientWidth, canvas.clientHeight - 22) / (1.2 + 0.024);
+      const place = (x, y) => [canvas.clientWidth / 2 + scale * x,
+        (canvas.clientHeight - 22) / 2 - scale * y];
+      const context = canvas.getContext("2d");
+      const seen = new Set();
+      for (let along = 0; along < 0.43; along += 0.0005) {
+        const [cos, sin] = [Math.cos(0.3), Math.sin(0.3)];
+        for (const [x, y] of [[along - 0.2, -0.45], [along * cos - 0.3, along * sin]]) {
+          seen.add(context.getImageData(...place(x, y).map(Math.floor), 1, 1).data.join());
+        }
+      }
+      return [...seen];
+    """
+    assert browser.execute_script(script) == ["185,189,196,255"]  # --box
+
+
+def test_full_screen_shows_the_arenas_and_the_controls_alone(browser, file):
+    _open(browser, file)
+    button = browser.find_element("css selector", "#full")
+    button.click()
+    WebDriverWait(browser, 20).until(lambda _: button.text == "Leave full screen")
+    assert _js(browser, "document.fullscreenElement.id") == "content"
+    assert [browser.find_element("css selector", each).is_displayed() for each in _PARTS] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+    _js(browser, "replay.seek(60)")
+    assert _shade(browser, ".arena", 1) > 20  # drawn, although no chart is laid out
+    ActionChains(browser).send_keys("f").perform()
+    WebDriverWait(browser, 20).until(lambda _: button.text == "Full screen")
+    assert browser.find_element("css selector", ".chart").is_displayed()
+
+
+_PARTS = ("#controls", ".arena", ".chart", "#key")
+
+
+def _gif(browser: Any) -> Any:
+    """Returns the film of the open episode."""
+    script = """
+      const done = arguments[0];
+      replay.gif().then((gif) => {
+        const reader = new FileReader();
+        reader.onload = () => done(reader.result.split(",")[1]);
+        reader.readAsDataURL(gif);
+      }, (error) => done(String(error)));
+    """
+    return Image.open(io.BytesIO(base64.b64decode(browser.execute_async_script(script))))
+
+
+def _differing(browser: Any, film: Any) -> float:
+    """Returns the share of pixels of a film's last picture that differ from the arena's."""
+    film.seek(film.n_frames - 1)
+    shown = np.asarray(film.convert("RGB"), int)[:480, :480]
+    script = """
+      const canvas = document.querySelector(".arena");
+      const card = document.createElement("canvas");
+      [card.width, card.height] = [480, 502];
+      const context = card.getContext("2d");
+      context.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--card");
+      context.fillRect(0, 0, 480, 502);
+      context.drawImage(canvas, 0, 0);
+      return [...context.getImageData(0, 0, 480, 480).data];
+    """
+    drawn = np.array(browser.execute_script(script)).reshape(480, 480, 4)[..., :3]
+    return (np.abs(shown - drawn).max(axis=-1) > 24).mean()
+
+
+def test_a_gif_ends_with_the_picture_that_the_page_ends_with(browser, file):
+    _open(browser, file)
+    browser.set_script_timeout(120)
+    film = _gif(browser)
+    assert film.size == (960, 502)  # two policies
+    _js(browser, "replay.seek(replay.frames - 1)")
+    # The page's arena takes the size of the film's.
+    browser.execute_script(
+        "const arena = document.querySelector('.arena'); arena.style.cssText ="
+        "'width: 480px; height: 502px; aspect-ratio: auto; max-height: none';"
+    )
+    WebDriverWait(browser, 20).until(
+        lambda _: _js(browser, "document.querySelector('.arena').width") == 480
+    )
+    assert _differing(browser, film) < 0.002
+
+
+def test_a_gif_plays_at_the_speed_of_the_page(browser, file):
+    _open(browser, file)
+    _js(browser, "document.getElementById('speed').value = 2")
+    last = _js(browser, "replay.frames") - 1
+    # At twice the speed 12.5 pictures a second are 5 control steps of 0.032 s apart.
+    assert _gif(browser).n_frames == 1 + -(-last // 5)
+
+
+def test_a_gif_is_saved_under_the_level_it_shows(browser, file, tmp_path):
+    _open(browser, file)
+    where = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    browser.execute_cdp_cmd("Page.setDownloadBehavior", where)
+    _js(browser, "replay.open(1)")
+    _js(browser, "document.getElementById('speed').value = 16")
+    browser.find_element("css selector", "#gif").click()
+    WebDriverWait(browser, 30).until(lambda _: [*tmp_path.glob("*.gif")])
+    assert [each.name for each in tmp_path.iterdir()] == ["episode-3.gif"]
 
 
 def test_everything_to_be_pressed_has_a_name(browser, file):

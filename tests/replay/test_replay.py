@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import policies
@@ -21,7 +22,8 @@ from swarmjax.policy import PolicyError
 from swarmjax.replay import __main__ as replay
 from swarmjax.replay import video
 from swarmjax.replay.config import ReplayConfig
-from swarmjax.replay.episodes import Pick, worst
+from swarmjax.replay.episodes import Pick, outcome, worst
+from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 from swarmjax.task.stage_files import load_levels
 
@@ -55,15 +57,16 @@ def test_the_worst_reached_least_then_touched_most_then_took_longest():
     assert worst(judged, 2) == order[:2]
 
 
-def _labels(capsys: pytest.CaptureFixture[str]) -> str:
-    said = capsys.readouterr().out.splitlines()[1]  # the first line states the training's settings
-    return said.split(": ", 1)[1].rsplit(";", 1)[0]
+def _levels(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Returns the levels that the command printed, as in `7 of s6`."""
+    lines = capsys.readouterr().out.splitlines()
+    return [each.split(":")[0].removeprefix("Episode ") for each in lines if each[:7] == "Episode"]
 
 
 def test_levels_are_written_in_the_order_in_which_they_were_named(steer, tmp_path, capsys):
     out = tmp_path / "new" / "a.html"
     assert replay.main([f"policy={steer}", *QUICK, "level=3,1", f"out={out}"]) == 0
-    assert _labels(capsys) == "level 3; level 1"
+    assert _levels(capsys) == ["3 of s6", "1 of s6"]
     assert out.read_text().startswith("<!DOCTYPE html>")
 
 
@@ -77,7 +80,7 @@ def test_the_worst_are_replayed(steer, tmp_path, capsys):
     assert len(set(zip(reached, contacts, frames, strict=True))) > 2  # the levels differ in these
     order = sorted(range(8), key=lambda i: (reached[i], -contacts[i], -frames[i], i))
     assert replay.main([*words, "worst=3", f"out={tmp_path / 'a.html'}"]) == 0
-    assert _labels(capsys) == "; ".join(f"level {i}" for i in order[:3])
+    assert _levels(capsys) == [f"{i} of s6" for i in order[:3]]
 
 
 def test_policies_replay_the_same_levels(steer, tmp_path):
@@ -118,9 +121,30 @@ def test_the_worst_of_a_suite_are_replayed(steer, suite, tmp_path, capsys):
     words = [f"policy={steer}", f"suite={suite}", f"out={tmp_path / 'a.html'}", "workers=1"]
     assert replay.main([*words, "worst=5", "steps=1"]) == 0
     # No robot arrives or touches anything in a single step, so the levels keep their order.
-    assert _labels(capsys) == "; ".join(
-        ["r1, level 4", "r1, level 0", "r1, level 7", "r2, level 4", "r2, level 0"]
-    )
+    assert _levels(capsys) == ["4 of r1", "0 of r1", "7 of r1", "4 of r2", "0 of r2"]
+
+
+def _ended(arrived: list[bool], steps: int) -> Any:
+    """Returns what `outcome` reads of a recording."""
+    frames = np.tile(arrived, (steps + 1, 1))
+    return SimpleNamespace(arrived=frames, pose=frames)
+
+
+@pytest.mark.parametrize(
+    ("runs", "arrival", "text"),
+    [
+        ([_ended([True, False], 384)], "latch", "1 of 2 robots arrived, 12.3 s"),
+        ([_ended([True], 10)], "latch", "1 of 1 robot arrived, 0.3 s"),
+        ([_ended([True, False], 10)], "hold", "1 of 2 robots within their targets, 0.3 s"),
+        (
+            [_ended([True, False], 1500), _ended([True, True], 384)],
+            "latch",
+            "1 and 2 of 2 robots arrived, 48.0 and 12.3 s",
+        ),
+    ],
+)
+def test_a_title_says_how_the_episode_ended(runs, arrival, text):
+    assert outcome(runs, TaskConfig(arrival=arrival)) == text
 
 
 def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):

@@ -4,6 +4,7 @@ const SPEEDS = [0.25, 0.5, 1, 2, 4, 8, 16];
 const TRAILS = [["off", 0], ["10 s", 10], ["whole", Infinity]]; // s
 const LONGEST = 1; // s between two pictures that count: a page in a hidden tab waits
 const REFRESH = 100; // ms between two readings of the numbers beside the pictures
+const FILM = { rate: 12.5, most: 300, side: 480 }; // of a GIF: pictures a second, pictures, px
 
 const page = (id) => document.getElementById(id);
 
@@ -41,6 +42,7 @@ function openEpisode(number) {
   state.ranges = chartRanges(runs);
   Object.assign(state.look, { colours: episode.colours, chosen: null });
   runs.forEach((run, i) => openView(state.views[i], episode, run));
+  document.title = page("title").textContent = episode.label;
   page("episode").value = number;
   page("timeline").max = state.last;
   show(0);
@@ -50,8 +52,8 @@ function openEpisode(number) {
 function openView(view, episode, run) {
   view.run = run;
   view.layer = null;
-  view.arena.setAttribute("aria-label", `Top view of ${episode.label}: `
-    + `${plural(run.robots, "robot")}, arena ${round(episode.side, 3)} m wide`);
+  view.arena.setAttribute("aria-label", `Top view of ${plural(run.robots, "robot")} `
+    + `in an arena ${round(episode.side, 3)} m wide`);
   view.robots.replaceChildren(...Array.from({ length: run.robots }, (_, i) => robotItem(i)));
 }
 
@@ -81,8 +83,8 @@ function show(frame) {
   state.frame = Math.min(Math.max(0, Math.round(frame)), state.last);
   const scene = state.header.episodes[state.episode];
   for (const view of state.views) {
-    if (!view.arena.clientHeight || !view.chart.clientHeight) continue; // not laid out
-    drawArena(view.arena, scene, view.run, state.frame, state.look);
+    if (view.arena.clientHeight) drawArena(view.arena, scene, view.run, state.frame, state.look);
+    if (!view.chart.clientHeight || !view.chart.clientWidth) continue; // as in full screen
     fit(view.chart); // the layer is as large as the chart
     view.layer ??= drawCharts(view.chart, view.run, state.last, state.ranges, state.look);
     drawCursor(view.chart, view.layer, view.run, state.frame, state.last, state.ranges, state.look);
@@ -219,10 +221,70 @@ function onKey(event) {
     "-": () => changeSpeed(-1),
     n: () => changeEpisode(1),
     p: () => changeEpisode(-1),
+    f: toggleFullScreen,
   }[event.key];
   if (!action) return;
   event.preventDefault();
   action();
+}
+
+// Full screen and film
+
+function toggleFullScreen() {
+  if (!document.fullscreenEnabled) return;
+  if (document.fullscreenElement) document.exitFullscreen();
+  else page("content").requestFullscreen();
+  page("play").focus(); // so that the space bar plays and pauses
+}
+
+function nameFullScreen() {
+  page("full").textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";
+}
+
+/** Films the open episode at the speed of the page, faster if it is too long; resolves to a GIF. */
+async function film(report = () => {}) {
+  const { header, last } = state;
+  const { rate, most, side } = FILM;
+  const [scene, look] = [header.episodes[state.episode], { ...state.look }];
+  const runs = state.views.map((view) => view.run);
+  const [width, height] = [side * runs.length, side + FOOT];
+  const arena = make("canvas", { width: side, height });
+  const context = make("canvas", { width, height }).getContext("2d", { willReadFrequently: true });
+  const stride = Math.max(Number(page("speed").value) / (rate * header.step), last / (most - 1));
+  const draw = (picture) => {
+    const t = Math.min(last, Math.round(picture * stride));
+    context.fillStyle = look.theme.card;
+    context.fillRect(0, 0, width, height);
+    runs.forEach((run, i) => {
+      drawArena(arena, scene, run, t, look);
+      context.drawImage(arena, i * side, 0);
+    });
+    context.fillStyle = look.theme.soft;
+    context.font = "12px system-ui, sans-serif";
+    context.textAlign = "right";
+    context.fillText(`${(t * header.step).toFixed(1)} s`, width - 8, height - 8);
+    return context.getImageData(0, 0, width, height).data;
+  };
+  const count = 1 + Math.ceil(last / stride);
+  return new Blob(await writeGif(width, height, count, 1 / rate, draw, report),
+    { type: "image/gif" });
+}
+
+async function saveGif() {
+  const button = page("gif");
+  const name = `episode-${state.header.episodes[state.episode].level}.gif`;
+  button.disabled = true;
+  try {
+    const gif = await film((share) => {
+      button.textContent = `Making it: ${Math.round(100 * share)} %`;
+    });
+    const href = URL.createObjectURL(gif);
+    make("a", { href, download: name }).click();
+    setTimeout(() => URL.revokeObjectURL(href), 60_000); // once it has been saved
+  } finally {
+    button.disabled = false;
+    button.textContent = "Save as GIF";
+  }
 }
 
 // The page
@@ -293,10 +355,8 @@ function buildPage() {
   page("speed").value = 1;
   for (const [name] of TRAILS) page("trails").append(make("option", {}, name));
   header.episodes.forEach((episode, i) => {
-    const share = episode.runs.map((run) =>
-      `${run.arrival.filter((step) => step > 0).length}/${run.arrival.length}`);
     page("episode").append(
-      make("option", { value: i }, `${episode.label} (${share.join(", ")} arrived)`));
+      make("option", { value: i }, episode.label.replace(/^Episode /, "")));
   });
   page("runs").className = header.policies.length > 1 ? "two" : "one";
   state.views = header.policies.map(makeView);
@@ -314,6 +374,10 @@ function listen() {
   page("timeline").addEventListener("input", (event) => seek(Number(event.target.value)));
   page("trails").addEventListener("change", setTrail);
   page("episode").addEventListener("change", (event) => openEpisode(Number(event.target.value)));
+  page("full").hidden = !document.fullscreenEnabled;
+  page("full").addEventListener("click", toggleFullScreen);
+  page("gif").addEventListener("click", saveGif);
+  document.addEventListener("fullscreenchange", nameFullScreen);
   document.addEventListener("keydown", onKey);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   new ResizeObserver(redraw).observe(page("runs"));
@@ -338,6 +402,7 @@ function publish() {
     seek,
     play,
     pause,
+    gif: () => film(),
     positions: perRobot((run, robot, t) => run.pose(robot, t)),
     distances: perRobot((run, robot, t) => run.distance(robot, t)),
     rewards: perRobot((run, robot, t) => run.reward(robot, t)),

@@ -12,8 +12,11 @@ function readTheme() {
 
 /** Fits a canvas to its place on the screen; returns a context that counts CSS pixels. */
 function fit(canvas) {
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  const ratio = window.devicePixelRatio || 1;
+  // A canvas of a film is in no page and keeps its own size.
+  const isShown = canvas.isConnected;
+  const width = isShown ? canvas.clientWidth : canvas.width;
+  const height = isShown ? canvas.clientHeight : canvas.height;
+  const ratio = (isShown && window.devicePixelRatio) || 1;
   const [columns, rows] = [Math.round(width * ratio), Math.round(height * ratio)];
   if (canvas.width !== columns || canvas.height !== rows) {
     canvas.width = columns;
@@ -91,20 +94,23 @@ function drawWalls(context, place, scene, theme) {
     context.lineTo(place.x(half), place.y(at));
   }
   context.stroke();
+  // One path: if each box were filled alone, the floor would shine through where two of them meet.
+  context.fillStyle = theme.box;
+  context.beginPath();
+  for (const box of scene.box) addBox(context, place, box);
+  context.fill();
   context.fillStyle = theme.wall;
   context.beginPath();
   square(half + FRAME);
   square(half);
   context.fill("evenodd");
-  context.fillStyle = theme.box;
-  for (const box of scene.box) fillBox(context, place, box);
 }
 
-function fillBox(context, place, [x, y, yaw, halfX, halfY]) {
+function addBox(context, place, [x, y, yaw, halfX, halfY]) {
   context.save();
   context.translate(place.x(x), place.y(y));
   context.rotate(-yaw);
-  context.fillRect(-halfX * place.scale, -halfY * place.scale,
+  context.rect(-halfX * place.scale, -halfY * place.scale,
     2 * halfX * place.scale, 2 * halfY * place.scale);
   context.restore();
 }
