@@ -1,5 +1,11 @@
-"""Cells of notebooks: shell reads as shell, a file as a file; a failure names file and line."""
+"""Cells of notebooks: shell reads as shell, a file as a file; a failure names file and line.
 
+A page keeps what each cell printed or drew in a block `text` or an image below the cell, for who
+reads it unbuilt. The build shows what the cell prints now instead, and compares: names and lines
+must be the same, numbers need not. Three dots stand for what was left out.
+"""
+
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +18,8 @@ from sphinx.util import logging
 _LOG = logging.getLogger(__name__)
 _SHELL = "%%bash\n"
 _FILE = "%%writefile "
+_NUMBER = re.compile(r"(?:\d+ (?:h|min) )*-?\d[\d,.]*(?:e-?\d+)?")
+_DRAWN = {"image/png", "text/html"}
 _LANGUAGES = {".yaml": "yaml", ".py": "python", ".c": "c"}
 
 
@@ -22,6 +30,7 @@ def _is_cell(node: nodes.Node) -> bool:
 def _tidy(app: Sphinx, document: nodes.document) -> None:
     """Reports failed cells, and takes the magic words off the others."""
     for cell in list(document.findall(_is_cell)):
+        _compare(app, cell)
         for block in list(cell.findall(nodes.literal_block)):
             if "traceback" in block["classes"]:
                 _report(app, cell, block)
@@ -29,6 +38,41 @@ def _tidy(app: Sphinx, document: nodes.document) -> None:
                 _rewrite(block, block.rawsource.removeprefix(_SHELL), "bash")
             elif block.rawsource.startswith(_FILE):
                 _as_file(cell, block)
+
+
+def agrees(stored: str, printed: str) -> bool:
+    """Tells whether two outputs differ in numbers and spaces only.
+
+    Args:
+      stored: what the page keeps. Three dots stand for anything.
+      printed: what the cell printed.
+    """
+    parts = [re.escape(_shape(part)) for part in re.split(r"\n?\.\.\.\n?", stored)]
+    return re.fullmatch(".*".join(parts), _shape(printed), re.DOTALL) is not None
+
+
+def _shape(text: str) -> str:
+    return re.sub(r"[ \t]+", "", _NUMBER.sub("#", text)).strip()
+
+
+def _compare(app: Sphinx, cell: Any) -> None:
+    """Takes the stored output off the page, and warns if it is not that of the cell."""
+    outputs = list(cell.findall(_is_output))
+    if not outputs or cell.astext().startswith(_FILE):
+        return
+    stored = cell.next_node(descend=False, siblings=True)
+    blocks = [block for output in outputs for block in output.findall(nodes.literal_block)]
+    printed = "\n".join(block.astext() for block in blocks)
+    if any(node.get("mime_type") in _DRAWN for node in cell.findall(nodes.container)):
+        fits = isinstance(stored, nodes.paragraph) and isinstance(stored[0], nodes.image)
+    else:
+        is_text = isinstance(stored, nodes.literal_block) and stored["language"] == "text"
+        fits = is_text and agrees(stored.astext(), printed)
+    if fits:
+        stored.parent.remove(stored)
+        return
+    where = (app.env.docname, cell.line)
+    _LOG.warning("below the cell stands no such output: %s", printed, location=where, type="site")
 
 
 def _report(app: Sphinx, cell: Any, block: nodes.literal_block) -> None:

@@ -9,26 +9,27 @@ from typing import Any
 _ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = _ROOT / "docs" / "tutorials" / "first-swarm.md"
 NOTEBOOK = _ROOT / "examples" / "first_swarm.ipynb"
-_CELL = re.compile(r"```\{code-cell\} ipython3\n(.*?)```\n", re.DOTALL)
+_CELL = re.compile(r"```\{code-cell\} ipython3\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", re.DOTALL)
 # Jupyter asks commands for colours, and progress would be drawn again and again.
 _FIRST = "%env TTY_COMPATIBLE=0"
 
 
-def cells(page: str) -> list[tuple[str, str]]:
+def cells(page: str) -> list[tuple[str, str, str]]:
     """Takes a tutorial apart.
 
     Args:
       page: its text.
 
     Returns:
-      Kind, `markdown` or `code`, and source of each cell.
+      Kind, `markdown` or `code`, source, and what is stored of its output, of each cell.
     """
-    body = page.split("---\n", 2)[2]
-    parts = _CELL.split(body)
-    kinds = ("markdown", "code")
-    found = [(kinds[i % 2], _source(kinds[i % 2], part)) for i, part in enumerate(parts)]
-    found = [(kind, source) for kind, source in found if source]
-    return [found[0], ("code", _FIRST), *found[1:]]
+    parts = _CELL.split(page.split("---\n", 2)[2])
+    found = [("markdown", _source("markdown", part), "") for part in parts[::3]]
+    code = zip(parts[1::3], parts[2::3], strict=True)
+    for place, (source, printed) in enumerate(code):
+        found.insert(2 * place + 1, ("code", _source("code", source), printed or ""))
+    found = [cell for cell in found if cell[1]]
+    return [found[0], ("code", _FIRST, ""), *found[1:]]
 
 
 def _source(kind: str, part: str) -> str:
@@ -39,7 +40,7 @@ def _source(kind: str, part: str) -> str:
 
 
 def notebook(page: str) -> dict[str, Any]:
-    """Makes a notebook of a tutorial, without outputs.
+    """Makes a notebook of a tutorial, with the texts that its cells printed.
 
     Args:
       page: its text.
@@ -48,10 +49,14 @@ def notebook(page: str) -> dict[str, Any]:
       The notebook, format 4.5.
     """
     every = []
-    for number, (kind, source) in enumerate(cells(page)):
+    for number, (kind, source, printed) in enumerate(cells(page)):
         cell = {"cell_type": kind, "id": f"cell-{number}", "metadata": {}}
         cell["source"] = source.splitlines(keepends=True)
-        every.append(cell | ({"execution_count": None, "outputs": []} if kind == "code" else {}))
+        stream = {"name": "stdout", "output_type": "stream"}
+        outputs = [stream | {"text": printed.splitlines(keepends=True)}] if printed else []
+        every.append(
+            cell | ({"execution_count": None, "outputs": outputs} if kind == "code" else {})
+        )
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
     return {"cells": every, "metadata": metadata, "nbformat": 4, "nbformat_minor": 5}

@@ -167,9 +167,9 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     for field, rules in _OPTIONAL.items():
         if _value(meta, field) is not _MISSING:
             _check_fields(meta, rules)
-            if field != "network" and "network" in meta:
+            if field == "memory" and "network" in meta:
                 raise PolicyError(
-                    f"meta.{field} and meta.network are both given: expected one of them."
+                    "meta.memory and meta.network are both given: expected one of them."
                 )
     if meta["policy"] == "shared" and meta["learners"] != 1:
         raise PolicyError(f"meta.learners is {meta['learners']}: expected 1 for a shared policy.")

@@ -1,6 +1,7 @@
 """Tests the checks of the site's build, and the notebook made from its first tutorial."""
 
 import importlib.util
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,9 @@ from swarmjax.shell import commands
 
 _ROOT = Path(__file__).parents[2]
 _NOTEBOOK_NEEDS = "needs the group docs: uv run --group docs"
+_TUTORIALS = sorted((_ROOT / "docs" / "tutorials").glob("[!i]*.md"))
+_MANY = re.MULTILINE | re.DOTALL
+_PICTURE = re.compile(r"^!\[.*?\]\((.*?)\)$", _MANY)
 
 
 def _extension(name: str) -> ModuleType:
@@ -62,6 +66,36 @@ def test_a_link_within_a_block_of_code_is_no_link(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("```\n[there](gone.md)\n```\n")
     assert list(_extension("site_links").dead(page)) == []
+
+
+@pytest.mark.parametrize("page", _TUTORIALS, ids=lambda page: page.stem)
+def test_what_a_cell_printed_or_drew_stands_below_it(page: Path) -> None:
+    text = page.read_text()
+    cells = re.findall(r"^```(?:\{code-cell\} ipython3|bash)\n(.*?)^```\n\n(?=(.*?)$)", text, _MANY)
+    assert len(cells) == len(re.findall(r"^```(?:\{code-cell\}|bash)", text, _MANY)) > 0
+    shown = [below for code, below in cells if not code.startswith("%%writefile")]
+    assert [below for below in shown if below != "```text" and not below.startswith("![")] == []
+
+
+def test_the_pictures_of_the_tutorials_are_small() -> None:
+    text = "".join(page.read_text() for page in _TUTORIALS)
+    sizes = [(_TUTORIALS[0].parent / name).stat().st_size for name in _PICTURE.findall(text)]
+    assert max(sizes) <= 150_000
+    assert sum(sizes) <= 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("stored", "agrees"),
+    [
+        ("one 1.5 s\n...\nlast [-0.1 2]", True),
+        ("one 1.5 s\nlast [-0.1 2]", False),
+        ("two ...", False),
+    ],
+)
+def test_a_stored_output_may_differ_in_numbers(stored: str, agrees: bool) -> None:
+    pytest.importorskip("myst_nb", reason=_NOTEBOOK_NEEDS)
+    printed = "one 2 min 03 s\nmore\nlast [ 3.25 -2]\n"
+    assert _extension("site_cells").agrees(stored, printed) == agrees
 
 
 @pytest.mark.slow
