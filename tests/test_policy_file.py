@@ -25,6 +25,7 @@ from swarmjax.exit_codes import USER_ERROR
 from swarmjax.export import __main__ as export
 from swarmjax.export.config import ExportConfig
 from swarmjax.policy import FORMAT, PolicyError
+from swarmjax.policy_file import fields
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.policy_export import policy_meta
 from swarmjax.task.observation import SIZE
@@ -75,6 +76,14 @@ def test_write_refuses_what_read_would_and_writes_nothing(tmp_path: Path) -> Non
     with pytest.raises(PolicyError, match=r"policy\.npz: actor/mean/bias holds a value"):
         policy_file.write(path, arrays, policies.meta())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_own_network_may_have_another_goal_and_step_limit() -> None:
+    task = _said()["task"] | {"goal": "gather", "step_limit": 100}
+    meta = _said() | {"network": "mine", "task": task}
+    own = {"actor/own/kernel": np.zeros((1, 2), np.float32)}
+    shared = {key: array for key, array in policies.arrays().items() if "normalizer" in key}
+    fields.check(own | shared, meta)
 
 
 def test_write_says_where_it_cannot_write(tmp_path: Path) -> None:
