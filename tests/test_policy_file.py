@@ -81,9 +81,7 @@ def test_write_refuses_what_read_would_and_writes_nothing(tmp_path: Path) -> Non
 def test_an_own_network_may_have_another_goal_and_step_limit() -> None:
     task = _said()["task"] | {"goal": "gather", "step_limit": 100}
     meta = _said() | {"network": "mine", "task": task}
-    own = {"actor/own/kernel": np.zeros((1, 2), np.float32)}
-    shared = {key: array for key, array in policies.arrays().items() if "normalizer" in key}
-    fields.check(own | shared, meta)
+    fields.check(policies.arrays(), meta)
 
 
 def test_write_says_where_it_cannot_write(tmp_path: Path) -> None:
