@@ -12,9 +12,10 @@ import types
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from swarmjax.config import values
+from swarmjax.config import reading, values
 from swarmjax.config.values import ConfigError, check_text, show
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
@@ -389,17 +390,14 @@ def unknown_key(key: str, cls: type[Section], where: str = "") -> ConfigError:
     """
     known = names(cls)
     dotted = {full.rpartition(".")[2]: full for full in reversed(keys(cls))}
-    near = [dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1)
+    path = Path(__file__).with_name(f"synonyms_{cls.command}.yaml")
+    synonyms = reading.read_yaml(path) if path.exists() else {}
+    near = [meant for meant, others in synonyms.items() if key in others]
+    near = near or ([dotted[key]] if key in dotted else difflib.get_close_matches(key, known, n=1))
     near = near or [dotted[name] for name in difflib.get_close_matches(key, dotted, n=1)]
-    near = near or [dotted[name] for name in dotted if len(key) > 1 and _initials(name, key)]
     meant = f" or {where}".join(near)
     hint = f"did you mean {where}{meant}?" if near else f"give one of {', '.join(known)}."
     return UnknownKeyError(f"{where}{key} is not a key: {hint}")
-
-
-def _initials(name: str, letters: str) -> bool:
-    """Returns whether letters are the first ones of the last words of a name, as lr in actor_lr."""
-    return "".join(word[0] for word in name.split("_") if word).endswith(letters)
 
 
 def _is_derived(item: dataclasses.Field[Any]) -> bool:

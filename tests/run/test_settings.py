@@ -131,9 +131,23 @@ def test_import_needs_neither_jax_nor_hydra():
         (["task.reward.progres=1"], "task.reward.progres is not a key: did you mean "
          "task.reward.progress?"),
         (["robots=3"], "robots is not a key: did you mean stage.robots?"),
-        (["name=s3"], "name is not a key: did you mean stage.name?"),
+        (["name=s3"], "name is not a key: did you mean run.dir or stage.name?"),
         (["learning_rate=1"], "learning_rate is not a key: did you mean "
          "algo.actor_learning_rate?"),
+        # Words of other tools.
+        *(([f"{word}=1"], f"{word} is not a key: did you mean run.dir?")
+          for word in ("out", "dir", "output", "folder", "logdir", "save")),
+        *(([f"{word}=1"], f"{word} is not a key: did you mean budget?")
+          for word in ("steps", "timesteps", "total_timesteps")),
+        *(([f"{word}=1"], f"{word} is not a key: did you mean arenas?")
+          for word in ("envs", "num_envs")),
+        (["epochs=4"], "epochs is not a key: did you mean algo.epochs?"),
+        (["gamma=1"], "gamma is not a key: did you mean algo.discount?"),
+        (["n_steps=8"], "n_steps is not a key: did you mean algo.rollout_length?"),
+        (["checkpoint=x"], "checkpoint is not a key: did you mean resume, init_from or "
+         "run.checkpoint_minutes?"),
+        *(([f"{word}=0"], f"{word} is not a key: did you mean devices or the environment variable "
+           "JAX_PLATFORMS=cpu or cuda?") for word in ("device", "gpu")),
         (["stage_name=x"], "stage_name is not a key: did you mean stage?"),
         (["hydra.verbose=1"], "hydra is not a key: give one of stage, robot, task, algo, "
          "curriculum, sim, seed, seeds, seeds_by, arenas, devices, streams, budget, "
@@ -151,8 +165,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "file .yaml."),
         (["stage=[s1,s2]"], "stage is '[s1,s2]': give stage=curriculum "
          f"'stage.sequence=[s1,s2]' for several, or one of {CHOICES}, or a file .yaml."),
-        (["lr=1e-3"], "lr is not a key: did you mean algo.critic_learning_rate or "
-         "algo.actor_learning_rate?"),
+        (["lr=1e-3"], "lr is not a key: did you mean algo.actor_learning_rate or "
+         "algo.critic_learning_rate?"),
         (["stage=expand"], "stage is 'expand': give expanded, the nearest, or one of "
          f"{CHOICES}, or a file .yaml."),
         (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or a file .yaml."),
