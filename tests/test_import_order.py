@@ -10,7 +10,7 @@ import swarmjax
 ROOT = Path(swarmjax.__file__).parent
 # `SHARED` holds what many rooms import. `ROOMS` lists all imports allowed to each room.
 SHARED = {"config", "epuck", "extension", "policy", "policy_file", "outputs"}
-SHARED |= {"provenance", "command", "exit_codes", "words"}
+SHARED |= {"provenance", "command", "exit_codes", "words", "life"}
 ROOMS = {
     "config": set(),
     "sim": {"config", "epuck"},
@@ -44,6 +44,7 @@ ALONE: dict[str, set[str]] = {
     "outputs": {"config"},
     "provenance": {"words"},
     "words": set(),
+    "life": {"words"},
     "shards": set(),
     "policy_network": {"extension"},
     "command": {"config", "policy", "exit_codes"},

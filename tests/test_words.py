@@ -1,5 +1,7 @@
 """Tests how commands print numbers."""
 
+import shlex
+
 import pytest
 
 from swarmjax import words
@@ -34,3 +36,28 @@ def test_many_things_have_separators() -> None:
 
 def test_a_plural_may_be_given() -> None:
     assert words.count(2, "policy", "policies") == "2 policies"
+
+
+def test_a_line_is_broken_between_words() -> None:
+    text = "a word " * 40
+    assert max(map(len, words.lines(text).splitlines())) <= 120
+    assert words.lines(text).split() == text.split()
+
+
+def test_a_long_path_stays_whole() -> None:
+    path = "folder/" * 30
+    assert path in words.lines(f"{path}: the report").splitlines()[0]
+
+
+def test_a_long_command_goes_on_after_a_backslash() -> None:
+    command = f"python -m swarmjax.evaluate policy={'a' * 90}"
+    said = words.lines(f"done; judge it with: {command.replace(' ', words.GLUE)}")
+    first, *rest = said.splitlines()
+    assert first == "done; judge it with:"
+    assert max(map(len, rest)) <= 120
+    assert shlex.split("\n".join(rest).replace("\\\n", "")) == command.split()
+
+
+def test_a_long_path_loses_its_beginning() -> None:
+    assert words.shorten("runs/first/policy.npz", 13) == "...policy.npz"
+    assert words.shorten("policy.npz", 13) == "policy.npz"
