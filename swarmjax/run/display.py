@@ -1,52 +1,40 @@
 """Shows a run while it trains, as plain lines."""
 
+import contextlib
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from swarmjax import words
+from swarmjax import life, words
 
 Row = Mapping[str, Any]
 
-LINE_SECONDS = 2.0  # shortest time between two lines
 
+def figures(rows: Sequence[Row], names: Sequence[str]) -> dict[str, str]:
+    """Formats what a call shows. `metrics.jsonl` has the rest.
 
-def figures(rows: Sequence[Row], names: Sequence[str], speeds: Row) -> dict[str, str]:
-    """Formats what a call shows.
-
-    The episodes that end in an update are a biased sample, because short ones end first. The newest
-    whole cohort measures how good the swarm is: all episodes that began within one step limit.
+    The episodes that end in an update are a biased sample, because short ones end first. All
+    episodes that began within one step limit measure how good the swarm is.
 
     Args:
       rows: rows of all seeds, as `recorder.rows` makes them, in order.
       names: names of the stages, in order.
-      speeds: speeds of the call over all seeds.
 
     Returns:
       Texts by name. Each is for the newest stage of each seed.
     """
     last = [row for row in rows if row["update"] == rows[-1]["update"]]
     newest = [names.index(row["stage"]) for row in last]
-    first, final = names[min(newest)], names[max(newest)]
+    ends = dict.fromkeys([names[min(newest)], names[max(newest)]])
 
     def cohort(column: str) -> str:
         return spread([row[column][stage] for row, stage in zip(last, newest, strict=True)])
 
-    stage_of = dict(zip((row["seed"] for row in last), newest, strict=True))
-    mine = [row for row in rows if names.index(row["stage"]) == stage_of[row["seed"]]]
     return {
-        "stage": first if first == final else f"{first} to {final}",
+        "stage": words.shorten(" to ".join(ends), 30),
         "targets reached": cohort("success_by_stage"),
         "all robots reached": cohort("complete_by_stage"),
-        "targets in episodes just ended": _ratio(mine, "reached", 100, " %"),
-        "contacts per robot": _ratio(mine, "contacts"),
-        "return": _ratio(mine, "reward"),
-        **{
-            name.removesuffix("_per_s").replace("_", " ") + "/s": f"{speed:,.0f}"
-            for name, speed in speeds.items()
-            if name.endswith("_per_s")
-        },
     }
 
 
@@ -59,36 +47,37 @@ def spread(shares: Sequence[float | None]) -> str:
     return f"{mean:.1f} %" + (f" ({low:.0f} to {high:.0f})" if low < high else "")
 
 
-def _ratio(rows: Sequence[Row], part: str, scale: float = 1.0, unit: str = "") -> str:
-    """Formats a mean over the targets of episodes that ended in a call, or `-` if none ended."""
-    targets = sum(row["targets"] for row in rows)
-    return f"{scale * sum(row[part] for row in rows) / targets:.3g}{unit}" if targets else "-"
-
-
 class Display:
     """Prints what a run says, line by line."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         """Prepares a display; with `quiet` nothing is printed."""
         self._quiet = quiet
-        self._last_line = -LINE_SECONDS
+        self._seconds = 2.0 if sys.stdout.isatty() else life.EVERY_S  # shortest between two lines
+        self._last_line = -self._seconds
 
-    def say(self, sentence: str) -> None:
-        """Prints a sentence."""
+    def say(self, sentence: str, width: int = words.WIDTH) -> None:
+        """Prints a sentence, on as many lines as it needs."""
         if not self._quiet:
-            sys.stdout.write(f"{sentence}\n")
-            sys.stdout.flush()
+            words.say(sentence, width)
+
+    @contextlib.contextmanager
+    def busy(self, work: str) -> Iterator[None]:
+        """Says that work begins, and while the block runs now and then that it goes on."""
+        self.say(f"{work} ...")
+        silent = self._quiet or sys.stderr is None  # closed
+        with contextlib.nullcontext() if silent else life.shown(lambda: f"still {work}"):
+            yield
 
     def show(
-        self, texts: Mapping[str, str], update: int, updates: int, seconds_left: float
+        self, texts: Mapping[str, str], update: int, updates: int, seconds_left: float, speeds: Row
     ) -> None:
-        """Prints the state of the run, at most every `LINE_SECONDS`, and at its end."""
-        if time.monotonic() < self._last_line + LINE_SECONDS and update < updates:
+        """Prints the state of the run in one line, not too often, and at its end."""
+        if time.monotonic() < self._last_line + self._seconds and update < updates:
             return
         self._last_line = time.monotonic()
-        shown = {
-            "update": f"{update:,} of {updates:,}",
-            **texts,
-            "time left": words.duration(seconds_left),
-        }
-        self.say("  ".join(f"{name} {text}" for name, text in shown.items()))
+        parts = [f"update {update:,} of {updates:,}", *(" ".join(each) for each in texts.items())]
+        speed = f"{speeds['arena_steps_per_s']:,.0f} steps/s"
+        parts += [f"{words.duration(seconds_left)} left", speed]
+        line = words.lines("  ".join(part.replace(" ", words.GLUE) for part in parts))
+        self.say(line.partition("\n")[0])  # without what does not fit

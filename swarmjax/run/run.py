@@ -173,14 +173,16 @@ class Run:
         self._stop.check()
         settings, self._kept = self.settings, self._read_checkpoint()
         source = warm_start.read(settings) if self._kept is None else None
-        self._display.say("building the arenas ...")
-        self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
-        init, given = jax.jit(mesh.init(self.program)), (self.schedule, mesh.lanes(settings))
-        if self._keep_traces:
-            init = traces.keep(self.program, "init", init, given)
-        self.state = self._first_state(init, given, source)
-        for sentence in sentences.first(self.program, self.path, self._kept, source):
-            self._display.say(sentence)
+        for sentence in sentences.first(settings, self.path, self._kept, source):
+            self._display.say(sentence, width=100)
+        with self._display.busy("building the arenas"):
+            self.program, self.schedule = programs.load(settings, by_robot=settings.run.episodes)
+            init, given = jax.jit(mesh.init(self.program)), (self.schedule, mesh.lanes(settings))
+            if self._keep_traces:
+                init = traces.keep(self.program, "init", init, given)
+            self.state = self._first_state(init, given, source)
+        if settings.run.verbose:
+            self._display.say(sentences.details(self.program))
         if self._has_ended():
             self._display.say(sentences.nothing_left(settings, self.update))
 
@@ -213,16 +215,15 @@ class Run:
 
     def compile(self) -> None:
         """Compiles the program and claims its memory, so that training cannot run out later."""
-        self._display.say("compiling ...")
         self._stop.check()
-        compiled = compile_chunk(
-            self.program, self.schedule, self.state, keep_trace=self._keep_traces
-        )
-        memory.check(self.settings, compiled.memory_bytes)
         began = time.perf_counter()
-        self._claim(compiled)
-        seconds = compiled.seconds + time.perf_counter() - began
-        self.compiled = replace(compiled, seconds=seconds)
+        with self._display.busy("compiling"):
+            compiled = compile_chunk(
+                self.program, self.schedule, self.state, keep_trace=self._keep_traces
+            )
+            memory.check(self.settings, compiled.memory_bytes)
+            self._claim(compiled)
+        self.compiled = replace(compiled, seconds=time.perf_counter() - began)
         self._stop.check()
         self._display.say(f"compiled in {words.duration(self.compiled.seconds)}")
 
@@ -344,7 +345,7 @@ class Run:
         for sentence in sentences.promotions(settings, decisions):
             self._display.say(sentence)
         left = self._pace * (settings.updates - self.update)
-        self._display.show(figures(rows, names, speeds), self.update, settings.updates, left)
+        self._display.show(figures(rows, names), self.update, settings.updates, left, speeds)
         for row in rows:
             self._stop.signalled |= self._on_update(dict(row)) is True
 

@@ -13,26 +13,17 @@ from swarmjax.run.policy_export import POLICY, seed_path
 from swarmjax.run.settings import TrainConfig
 from swarmjax.training.rollout import Program
 
-_LISTED = 12  # stages that a run names one by one
-
 
 def first(
-    program: Program[TrainConfig], run: Path, kept: Kept | None, source: Kept | None
+    settings: TrainConfig, run: Path, kept: Kept | None, source: Kept | None
 ) -> Iterator[str]:
-    """Describes what is trained, which engine steps the robots, and what the run starts from."""
-    settings, engine = program.config, program.world.physics.engine
-    steps, seeds = settings.arenas * settings.algo.rollout_length, settings.numbers
-    several = f", seeds {seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else ""
-    names = settings.stage_names
-    listed = ", ".join(names)
-    if len(names) > _LISTED:
-        listed = f"{names[0]} to {names[-1]}, {len(names)} stages"
+    """Describes what is trained on what and into which folder, and what the run starts from."""
+    names, title, seeds = settings.stage_names, settings.stage_name, settings.numbers
+    stages = words.shorten(title, 40) + (f" {names[0]} to {names[-1]}" if len(names) > 1 else "")
+    several = f" of seeds {seeds[0]} to {seeds[-1]}" if settings.seeds > 1 else ""
     yield (
-        f"swarmjax: {settings.stage_name} ({listed}), "
-        f"{words.count(settings.updates, 'update')} of {words.count(steps, 'arena control step')} "
-        f"({words.count(settings.arenas, 'arena')}){several} on "
-        f"{provenance.device()}; {settings.robot.body} robots stepped by {engine.label}, "
-        f"sim.solver={engine.solver} sim.impl={engine.impl}; into {run}"
+        f"{words.shorten(stages, 60)}, {words.count(settings.updates, 'update')}{several} on "
+        f"{provenance.device()}, into{words.GLUE}{run}"
     )
     if settings.extensions is not None:
         used = (f"{kind} {name}" for kind, names in settings.pieces.items() for name in names)
@@ -47,6 +38,15 @@ def first(
         yield (
             f"starting with the networks and the normaliser of {settings.init_from} after {updates}"
         )
+
+
+def details(program: Program[TrainConfig]) -> str:
+    """Says how many arenas there are, and which engine steps the robots."""
+    settings, engine = program.config, program.world.physics.engine
+    return (
+        f"{words.count(settings.arenas, 'arena')}; {settings.robot.body} robots stepped by "
+        f"{engine.label}, sim.solver={engine.solver} sim.impl={engine.impl}"
+    )
 
 
 def nothing_left(settings: TrainConfig, update: int) -> str:
@@ -73,13 +73,11 @@ def promotions(settings: TrainConfig, decisions: Iterable[Row]) -> Iterator[str]
 def diverged(settings: TrainConfig, row: Row, updates: int, *, broke: bool) -> str:
     """Says that a run has stopped learning: all arenas broke, or no gradient step was finite."""
     where = f" of seed {row['seed']}" if settings.seeds > 1 else ""
-    what = f"every arena{where} broke at every step"
-    if not broke:
-        what = f"no gradient step{where} was finite"
+    what = "every arena{} broke at every step" if broke else "no gradient step{} was finite"
     return (
-        f"{what} in {words.count(updates, 'update')} up to update {row['update'] + 1:,}: give "
-        "lower algo.actor_learning_rate and algo.critic_learning_rate, or look at metrics.jsonl "
-        "for what broke."
+        f"{what.format(where)} in {words.count(updates, 'update')} up to update "
+        f"{row['update'] + 1:,}: give lower algo.actor_learning_rate and "
+        "algo.critic_learning_rate, or look at metrics.jsonl for what broke."
     )
 
 
@@ -91,14 +89,14 @@ def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     shares = [row[column][-1] for row in newest]
     said = f"{what} on {settings.stage_names[-1]}: {spread(shares)}"
     if all(share is None for share in shares):
-        return f"{said}: no whole cohort of episodes has ended"
+        return f"{said}: the run was too short on this stage"
     steps = settings.task.step_limit
     seconds = steps * settings.task.control_step
     measured = [row for row in newest if row[column][-1] is not None]
     episodes = min(row["episodes_by_stage"][-1] for row in measured)
     return (
-        f"{said} within {steps} control steps ({seconds:.3g} s), in a whole cohort of "
-        f"{words.count(episodes, 'episode')}"
+        f"{said} within {steps} control steps ({seconds:.3g} s), over "
+        f"{words.count(episodes, 'episode')} begun together"
     )
 
 
@@ -110,7 +108,7 @@ def closing(settings: TrainConfig, run: Path, update: int, *, ended: bool) -> st
         how = "saved" if saved == update else f"saved at update {saved:,}, the last sound one"
         return (
             f"stopped after update {update:,} of {settings.updates:,}, {how}; go on with: "
-            f"{command.line('train', f'resume={run}', *code)}"
+            f"{_command('train', f'resume={run}', *code)}"
         )
     policy = seed_path(run / POLICY, settings, settings.seed)
     what = "the policy" if settings.seeds == 1 else f"each of {settings.seeds} policies"
@@ -118,4 +116,8 @@ def closing(settings: TrainConfig, run: Path, update: int, *, ended: bool) -> st
     if update < settings.updates:
         goal = f"run.stop_at={show(settings.run.stop_at)}"
         why = f" after update {update:,} of {settings.updates:,}, as every seed has reached {goal}"
-    return f"done{why}; judge {what} with: {command.line('evaluate', f'policy={policy}', *code)}"
+    return f"done{why}; judge {what} with: {_command('evaluate', f'policy={policy}', *code)}"
+
+
+def _command(*arguments: str) -> str:
+    return command.line(*arguments).replace(" ", words.GLUE)

@@ -28,11 +28,11 @@ class RunConfig(Section):
     )
     stop_at: float | None = setting(
         None,
-        "success of every seed on the last stage, by curriculum.success in a whole cohort, at "
-        "which the run ends",
+        "success of every seed on the last stage (curriculum.success) at which the run ends",
         above=0.0,
         high=1.0,
     )
+    verbose: bool = setting(False, "name the engine too")
     tensorboard: bool = setting(True, "write TensorBoard events")
     wandb: str | None = setting(None, "Weights & Biases project to log to; needs the extra wandb")
     episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")
