@@ -24,15 +24,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from scipy.special import betaincinv
 
-from swarmjax import command, provenance
+from swarmjax import command, provenance, words
 from swarmjax.curriculum.engine import UNCOUNTED, Schedule
+from swarmjax.evaluate import table as evaluate_table
 from swarmjax.evaluate.statistics import CONFIDENCE, Interval
-from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.run import compile_cache, memory
 from swarmjax.run.load_settings import load_as
 from swarmjax.run.settings import ProbeConfig
@@ -211,15 +210,14 @@ def _holds(task: TaskConfig) -> bool:
     return task.arrival == "hold" and paid(task) == "all"
 
 
-def _table(settings: ProbeConfig, counts: Sequence[Counts], *, plain: bool) -> Table:
+def _table(settings: ProbeConfig, counts: Sequence[Counts], console: Console) -> Table:
     """Makes the table with a row for each stage."""
     signal = paid(settings.task)
     columns = list(dict.fromkeys([settings.curriculum.success, signal]))
-    table = Table(box=None if plain else box.SIMPLE)
     heads = ["stage", "robots", "episodes", *(_HEADS[each] for each in columns)]
     more = ["at most, if independent"] if _holds(settings.task) else []
-    for i, head in enumerate([*heads, "control steps", "paid in the budget", *more]):
-        table.add_column(head, justify="right" if i else "left", no_wrap=True)
+    heads += ["control steps", "paid in the budget", *more]
+    table = evaluate_table.make_table(console, *heads)
     for stage, each in zip(settings.stage, counts, strict=True):
         shares = (Interval(*(100 * p for p in each.share(what))) for what in columns)
         shown = ("{:.1f} [{:.1f}, {:.1f}]".format(*share) for share in shares)
@@ -276,13 +274,10 @@ def _number(value: float) -> str:
 def main(arguments: Sequence[str]) -> int:
     """Runs the command; returns its exit code."""
     settings = load_as(ProbeConfig, arguments)
-    console = Console()
-    if not console.is_terminal:
-        console.width = PLAIN_WIDTH
-    say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
+    console, say = evaluate_table.console(), words.say
     say(f"untrained swarm of seed {settings.seed}; a budget of {settings.budget:,} control steps")
     counts = probe(settings)
-    console.print(_table(settings, counts, plain=not console.is_terminal))
+    console.print(_table(settings, counts, console))
     say(conclusion(settings, counts))
     return 0
 

@@ -24,15 +24,11 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress
-
-from swarmjax import command, outputs
+from swarmjax import command, life, outputs, words
 from swarmjax.evaluate import table as evaluate_table
 from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.evaluation import Evaluation, evaluate
-from swarmjax.evaluate.table import PLAIN_WIDTH
 from swarmjax.exit_codes import INTERRUPTED
 
 
@@ -42,22 +38,17 @@ def main(arguments: Sequence[str]) -> int:
     out = None if settings.out is None else Path(settings.out)
     if out is not None:
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
-    progress = Progress(console=Console(stderr=True), transient=True)
-    progress.disable = not progress.console.is_terminal
     try:
-        with progress:
+        with life.progress("evaluate") as progress:
             # Says which settings come from the policies before judging, which takes a minute.
-            announce = partial(print, f"swarmjax.evaluate: {said}", flush=True)
+            announce = partial(words.say, f"swarmjax.evaluate: {said}")
             evaluation = evaluate(settings, None, progress, announce)
     except KeyboardInterrupt:
         sys.stderr.write("swarmjax.evaluate: interrupted, nothing was written.\n")
         return INTERRUPTED
     if out is not None:
         outputs.write(_content(out, evaluation))
-    console = Console()
-    if not console.is_terminal:
-        console.width = PLAIN_WIDTH
-    evaluate_table.show(console, evaluation.result)
+    evaluate_table.show(evaluate_table.console(), evaluation.result)
     return 0
 
 

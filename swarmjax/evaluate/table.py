@@ -10,10 +10,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from swarmjax import words
 from swarmjax.evaluate.measures import MEASURES, Measure
 from swarmjax.evaluate.trials import Entrant, Trial
-
-PLAIN_WIDTH = 160  # letters in a line of a table that is written to a file
 
 # Columns of a table with several cells: heading, measure, statistic, and whether to show the
 # interval.
@@ -24,9 +23,16 @@ _COLUMNS = (
     ("SPL, %", "spl", "mean", False),
     ("time, s", "time_to_reach_s", "mean", False),
     ("contacts", "contacts_per_robot", "mean", False),
-    ("with robots", "contacts_robot", "mean", True),
-    ("deadlocks, %", "deadlocks", "mean", False),
+    ("with robots", "contacts_robot", "mean", False),
+    ("stuck, %", "deadlocks", "mean", False),
 )
+
+
+def console() -> Console:
+    """Returns a console for standard output, without lines that are too long."""
+    found = Console()
+    found.width = min(found.width, words.WIDTH) if found.is_terminal else words.WIDTH
+    return found
 
 
 def show(console: Console, result: Mapping[str, Any]) -> None:
@@ -42,7 +48,7 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
     where = cells[0]["cell"] if result["suite"] is None else f"suite {result['suite']}"
     episodes = sum(cell["episodes"] for cell in cells)
     acting = ", each robot's most likely action" if result["action"] == "mean" else ""
-    _say(console, f"{who} on {where}, {episodes:,} episodes{acting}")
+    words.say(f"{who} on {where}, {episodes:,} episodes{acting}")
     own = {name: Measure(**each) for name, each in result.get("own_measures", {}).items()}
     about = {**MEASURES, **own}
     if "compared" in result:
@@ -56,32 +62,29 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
         _show_cells(console, result)
     for cell in cells:
         if cell["unreachable"]:
-            _say(
-                console,
+            words.say(
                 f"{cell['unreachable']} of {cell['episodes']:,} levels of {cell['cell']} have a "
-                "target that no robot can reach.",
+                "target that no robot can reach."
             )
 
 
 def _names(side: Sequence[Mapping[str, str]]) -> str:
     more = len(side) - 1
-    return f"{side[0]['path']}{f' and {more} more' if more else ''}"
+    return f"{words.shorten(side[0]['path'], 80)}{f' and {more} more' if more else ''}"
 
 
-def _say(console: Console, text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def _table(console: Console, *heads: str) -> Table:
-    table = Table(box=box.SIMPLE if console.is_terminal else None)
+def make_table(console: Console, *heads: str) -> Table:
+    """Makes a table without rows; a long name in its first column is broken, but no number."""
+    form, left = box.SIMPLE if console.is_terminal else None, int(len(heads) < 9)
+    table = Table(box=form, padding=(0, 1, 0, left))
     for i, head in enumerate(heads):
-        table.add_column(head, justify="right" if i else "left", no_wrap=True)
+        table.add_column(head, justify="right" if i else "left", no_wrap=bool(i), overflow="fold")
     return table
 
 
 def _show_cell(console: Console, cell: Mapping[str, Any], about: Mapping[str, Measure]) -> None:
     """Prints one cell: a row for each measure."""
-    table = _table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
+    table = make_table(console, "", "mean", "95 %", "IQM", "95 %", "worst 5 %")
     for name, figures in cell["measures"].items():
         measure = about[name]
         mean, iqm, worst = (_number(figures[key], measure) for key in ("mean", "iqm", "cvar"))
@@ -92,7 +95,7 @@ def _show_cell(console: Console, cell: Mapping[str, Any], about: Mapping[str, Me
 
 def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
     """Prints several cells: a row for each, and one for all if they can be pooled."""
-    table = _table(console, "", "levels", *(column[0] for column in _COLUMNS))
+    table = make_table(console, "", "levels", *(column[0] for column in _COLUMNS))
     pooled = [] if result["pooled"] is None else [{"cell": "all", **result["pooled"]}]
     for cell in (*result["cells"], *pooled):
         values = (_shown(cell["measures"], *column[1:]) for column in _COLUMNS)
@@ -113,17 +116,14 @@ def _show_comparison(
 ) -> None:
     """Prints one cell of a comparison: a row for each measure."""
     heads = ("a", "b", "b - a", "95 %", "b better, %", "95 %")
-    table = _table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
+    table = make_table(console, f"{cell['cell']}, {cell['episodes']:,} levels", *heads)
     for name, figures in cell["measures"].items():
         measure, share = about[name], MEASURES["targets_reached"]
         row = [_number(figures["a"], measure), _number(figures["b"], measure)]
         if "difference" in figures:
-            row += [
-                _number(figures["difference"], measure, "+"),
-                _interval(figures["difference_interval"], measure, "+"),
-                _number(figures["improvement"], share),
-                _interval(figures["improvement_interval"], share),
-            ]
+            for key, of, sign in (("difference", measure, "+"), ("improvement", share, "")):
+                row.append(_number(figures[key], of, sign))
+                row.append(_interval(figures[f"{key}_interval"], of, sign))
         table.add_row(_label(measure), *row)
     console.print(table)
 

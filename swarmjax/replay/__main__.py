@@ -24,10 +24,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress
-
-from swarmjax import command, outputs
+from swarmjax import command, life, outputs, words
 from swarmjax.config import ConfigError
 from swarmjax.evaluate import trained_settings
 from swarmjax.evaluate import trials as evaluate_trials
@@ -46,23 +43,21 @@ def main(arguments: Sequence[str]) -> int:
     if video:
         _check_output("video", video, ".mp4")
         replay_video.check()
-    progress = Progress(console=Console(stderr=True), transient=True)
-    progress.disable = not progress.console.is_terminal
-    words = command.line("replay", *arguments)
-    with progress:
+    made_by = command.line("replay", *arguments)
+    words.say(f"swarmjax.replay: {said}")
+    with life.progress("replay") as progress:
         episodes = replay(settings, entrants, progress)
-        page = replay_page.page(settings, [each.policy for each in entrants], episodes, words)
+        page = replay_page.page(settings, [each.policy for each in entrants], episodes, made_by)
         outputs.write({out: page.encode()})
         if video:
             pictures = [replay_video.rows(settings, each.runs) for each in episodes]
             bar = progress.add_task("pictures", total=sum(map(len, pictures)))
             report = partial(progress.advance, bar)
             replay_video.write(video, settings, episodes, report)
-    sys.stdout.write(f"swarmjax.replay: {said}\n")
     sys.stdout.writelines(f"{episode.label}\n" for episode in episodes)
-    sys.stdout.write(f"{out}: {len(page) / 1e6:.2f} MB.\n")
+    words.say(f"{out}: {len(page) / 1e6:.2f} MB.")
     if video:
-        sys.stdout.write(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.\n")
+        words.say(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.")
     return 0
 
 

@@ -75,7 +75,7 @@ def compare(runs: Sequence[Path], out: Path) -> None:
 
     png = drawing.png(comparison.success(groups, stages))
     (picture,) = builder.write(out, {"comparison.png": png})
-    sys.stdout.write(f"{picture}: success on {words.count(len(stages), 'stage')} over training.\n")
+    words.say(f"{picture}: success on {words.count(len(stages), 'stage')} over training.")
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str]) -> int:
     made_by = command.line("report", *arguments)
     written = write(run, out, made_by)
     figures = words.count(len(written) - 1, "figure")
-    sys.stdout.write(f"{written[-1]}: the report of {run}, with {figures}.\n")
+    words.say(f"{written[-1]}: the report of {run}, with {figures}.")
     return 0
 
 

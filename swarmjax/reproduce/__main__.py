@@ -27,10 +27,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.console import Console
-from rich.progress import Progress
 
-from swarmjax import command, provenance
+from swarmjax import command, life, provenance
 from swarmjax.config import ConfigError, check_text, files, section, to_dict
 from swarmjax.evaluate import trials
 from swarmjax.exit_codes import FAILED
@@ -115,9 +113,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
         for arm, seed, stage, action in every
         if (arm, seed, stage, action) not in known
     ]
-    progress = Progress(console=Console(stderr=True), transient=True)
-    progress.disable = not progress.console.is_terminal
-    with progress:
+    with life.progress("reproduce") as progress:
         bar = progress.add_task("policies judged", total=len(tasks))
         for row in trials.work(judge.judge, tasks, min(provenance.cores(), len(tasks))):
             rows.append(row)

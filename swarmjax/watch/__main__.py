@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarmjax import command
+from swarmjax import command, words
 from swarmjax.config import files
 from swarmjax.watch.config import WatchConfig
 from swarmjax.watch.live_page import LivePage
@@ -25,8 +25,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs the command; Ctrl-C ends it."""
     settings = files.load(WatchConfig, arguments)
     with Server(settings.port, LivePage(Path(settings.run))) as server:
-        sys.stdout.write(f"{server.url} follows {settings.run}; Ctrl-C ends it.\n")
-        sys.stdout.flush()
+        words.say(f"{server.url} follows {settings.run}; Ctrl-C ends it.")
         server.serve_forever()
     return 0
 

@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ import pytest
 import steering
 from steering import SPEED, STAY, STEP
 
-from swarmjax import command, policy
+from swarmjax import command, life, policy
 from swarmjax.config import build, files, to_dict
 from swarmjax.evaluate import __main__ as evaluate_command
 from swarmjax.evaluate import cells, statistics
 from swarmjax.evaluate import summary as evaluate_summary
+from swarmjax.evaluate import table as evaluate_table
 from swarmjax.evaluate import trials as evaluate_trials
 from swarmjax.evaluate.cells import Cell
 from swarmjax.evaluate.config import EvaluateConfig
@@ -229,6 +231,39 @@ def test_the_command_writes_the_result_and_prints_a_table(
     assert printed.err == ""
 
 
+def test_no_line_of_an_evaluation_is_too_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = steering.write(tmp_path / ("long" * 40) / "policy.npz")
+    assert _command(monkeypatch, f"policy={path}", "stage=s1", "episodes=3", "steps=2") == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 120
+
+
+def test_no_line_about_a_suite_is_too_long(
+    tmp_path: Path, suite: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = steering.write(tmp_path / "policy.npz")
+    result = evaluate(_config(path, stage=_stage(2), suite=str(suite), steps=2)).result
+    for i, cell in enumerate(result["cells"]):
+        cell["cell"] = f"a_cell_with_a_long_name_{i}"
+        for figures in cell["measures"].values():
+            figures |= {"mean": 0.99996, "mean_interval": [0.99996, 0.99996]}
+    evaluate_table.show(evaluate_table.console(), result)
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= 120
+    assert printed.count("100.0 [100.0, 100.0]") == 4  # no number is cut
+
+
+def test_an_evaluation_without_a_terminal_says_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(life, "EVERY_S", 0.01)
+    path = steering.write(tmp_path / "policy.npz")
+    assert _command(monkeypatch, f"policy={path}", "stage=s1", "episodes=3", "steps=300") == 0
+    time.sleep(0.5)  # until the filter has written all
+    assert "of 3 episodes after" in capfd.readouterr().err
+
+
 @pytest.fixture
 def suite(tmp_path: Path) -> Path:
     """Writes the levels of a suite of two small cells; returns the path of the file."""
@@ -268,7 +303,8 @@ def test_a_suite_and_several_policies_fill_a_folder(
     assert result["pooled"]["measures"]["targets_reached"]["mean"] == pytest.approx(np.mean(every))
     printed = capsys.readouterr().out
     assert "seed0.npz and 2 more on suite tiny, 9 episodes" in printed
-    assert [line.split()[0] for line in printed.splitlines()[3:]] == ["one", "two", "all"]
+    rows = printed.partition("stuck, %")[2].splitlines()[1:]
+    assert [line.split()[0] for line in rows] == ["one", "two", "all"]
 
 
 def test_a_comparison_is_written_and_shown(
@@ -290,7 +326,7 @@ def test_a_comparison_is_written_and_shown(
     means = [float(r["targets_reached"]) for r in rows if r["policy"] == str(b)]
     assert result["pooled"]["measures"]["targets_reached"]["b"] == pytest.approx(np.mean(means))
     printed = capsys.readouterr().out
-    assert f"{a} against {b} on suite tiny, 9 episodes" in printed
+    assert f"{a} against {b} on suite tiny, 9 episodes" in " ".join(printed.split())
     heads = [line.split(" levels")[0].strip() for line in printed.splitlines() if " levels" in line]
     assert heads == ["one, 4", "two, 5", "all, 9"]
     assert result["pooled"]["episodes"] == 9
@@ -308,7 +344,8 @@ def test_a_suite_that_is_not_pooled_has_no_row_of_all(
     words = (f"suite={suite}", "steps=2", "workers=1")
     assert _command(monkeypatch, f"policy={path}", *words) == 0
     printed = capsys.readouterr().out
-    assert [line.split()[0] for line in printed.splitlines()[3:]] == ["one", "again"]
+    rows = printed.partition("stuck, %")[2].splitlines()[1:]
+    assert [line.split()[0] for line in rows] == ["one", "again"]
     assert _command(monkeypatch, f"compare={path},{path}", *words) == 0
     printed = capsys.readouterr().out
     heads = [line.split(" levels")[0].strip() for line in printed.splitlines() if " levels" in line]

@@ -12,6 +12,7 @@ import policies
 import pytest
 import replays
 import steering
+from rich.progress import Progress
 from sentences import refusal
 
 from swarmjax import command, policy_file
@@ -87,7 +88,7 @@ def test_policies_replay_the_same_levels(steer, tmp_path):
     ahead = steering.write(tmp_path / "ahead.npz", steering.AHEAD)
     settings = load_levels(ReplayConfig, [f"policy={steer},{ahead}", *QUICK, "level=2"])
     entrants = trials.read_policies(settings.policies)
-    progress = replay.Progress(disable=True)
+    progress = Progress(disable=True)
     (episode,) = replay.replay(settings, entrants, progress)
     first, second = episode.runs
     np.testing.assert_array_equal(first.pose[0], second.pose[0])
@@ -159,7 +160,7 @@ def test_only_levels_that_are_named_are_drawn(steer, monkeypatch):
 
     monkeypatch.setattr(judge, "draw_level", count)
     entrants = trials.read_policies(settings.policies)
-    seven, two = replay.replay(settings, entrants, replay.Progress(disable=True))
+    seven, two = replay.replay(settings, entrants, Progress(disable=True))
     assert drawn[:2] == [7, 2]
     assert set(drawn[2:]) <= {0}  # the engine is compiled with level 0
     levels = cells.split(every.levels)
