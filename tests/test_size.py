@@ -17,9 +17,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
-    "code lines of swarmjax": 19_163,
+    "code lines of swarmjax": 19_192,
     "code lines of benchmarks": 4_500,
-    "keys of train": 140,
+    "keys of train": 141,
     "longest file": 450,
     "longest function": 60,
 }
