@@ -1,5 +1,6 @@
 """Proximal policy optimisation of one learner: pure functions that know nothing about the task.
 
-Of this project it imports only `config`. `ppo.py` is plain PPO. `dispatch.py` alone knows the
-faster ways of `fast/`, and everything works without them. Start with `PPO.update`.
+The only other package of this project that it imports is `config`. `ppo.py` is plain PPO. Only
+`dispatch.py` uses `fast/`, which computes the same updates faster, and everything works without
+`fast/`. Start with `PPO.update`.
 """

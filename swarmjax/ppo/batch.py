@@ -1,4 +1,4 @@
-"""From the trajectory of a rollout to the samples of an update: advantages and returns.
+"""Turns the trajectory of a rollout into samples of an update, with advantages and returns.
 
 T stands for control steps, A for arenas, N for the robots of an arena that one learner drives. An
 arena's samples form a group, which minibatches do not split.
@@ -17,15 +17,15 @@ from swarmjax.shards import ALONE, Shards
 
 
 class Trajectory(NamedTuple):
-    """A learner's observations and actions and their results, [T, A, N, ...].
+    """A learner's observations, actions and rewards in a rollout, [T, A, N, ...].
 
     Attributes:
       observation: [.., O], raw.
       action: [.., U].
-      log_prob: of the action.
-      value: of the observation.
+      log_prob: log density of the action.
+      value: the critic's value of the observation.
       next_value: value of the observation after the step, before any reset.
-      reward: of the step.
+      reward: reward for the step.
       terminated: whether nothing more can be earned after the step.
       truncated: whether the time ran out with the step.
       valid: whether to learn from the transition.
@@ -48,18 +48,20 @@ class Trajectory(NamedTuple):
 class Batch:
     """The samples of one update, in G groups of N. Invalid samples may hold anything, NaN included.
 
-    A minibatch has the same fields with one axis of samples, [B], and memory [S, H].
+    A minibatch has the same fields, but its samples lie on one axis, [B, ...], and its memories are
+    [S, H].
 
     Attributes:
       observation: [G, N, O], raw.
-      action: [G, N, U], as drawn.
-      log_prob: [G, N], of the action under the policy that drew it.
+      action: [G, N, U], as sampled, before any clipping.
+      log_prob: [G, N], log density of the action under the policy that sampled it.
       advantage: [G, N]. The update normalises the advantages over the valid samples, unless they
         come from Monte-Carlo returns, which are normalised already.
       return_: [G, N], target of the critic.
       valid: [G, N], bool or 0/1.
-      memory: [G, S, H], memory of the S robots of a group before the rollout; () each without
-        memory. With memory, the N samples of a group are ordered by step, [T S].
+      memory: Memories of actor and critic before the rollout, each [G, S, H] for the S robots of a
+        group, or () without memory. With memory, the N samples of a group are ordered by step,
+        [T S].
       begins: [G, N], whether an episode begins with the step; None without memory.
       state: [G, N, P], numbers of order 1 that the critic sees in addition; () if there are none.
     """
@@ -86,13 +88,13 @@ def make(
 
     Args:
       trajectory: [T, A, N, ...].
-      memory: [A, N, H], memory before the rollout; () each without memory.
+      memory: Memories of actor and critic before the rollout, each [A, N, H], or () without memory.
       over: [T, A], whether an arena's episode ended with the step.
-      config: defines the return.
+      config: says how to compute advantages and returns.
       shards: how the arenas are spread over devices.
 
     Returns:
-      A groups with T * N samples.
+      A batch of A groups, each with T * N samples.
     """
     if config.advantage == "gae":
         advantages, returns = generalized_advantages(
@@ -106,7 +108,8 @@ def make(
         )
     else:
         boundary = trajectory.terminated | trajectory.truncated
-        # As `PPO.update` of PPO-PyTorch (nikhilbarhate99, commit 728cce8): nothing is bootstrapped.
+        # As in `PPO.update` of PPO-PyTorch (nikhilbarhate99, commit 728cce8), nothing is
+        # bootstrapped.
         returns = sum_back(trajectory.reward, boundary, config.discount)
         returns = normalize(returns, trajectory.valid, shards, ddof=1, epsilon=1e-7)
         advantages = returns - trajectory.value
@@ -146,7 +149,7 @@ def generalized_advantages(
 
     Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
     Estimation", equation 16. The sum is cut at the end of each episode and of the rollout. Values
-    after an end, NaN included, never affect steps before it.
+    after the end of an episode, NaN included, never affect steps before this end.
 
     Args:
       rewards: [T, ...], reward of step t.
@@ -178,7 +181,8 @@ def sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
       factor: Discount per step, 0..1.
 
     Returns:
-      [T, ...] the sum of the term and of the factor times the sum of the step after.
+      [T, ...]: the term of each step, plus `factor` times the result of the next step unless the
+      step is an end.
     """
 
     def add(following: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -198,7 +202,7 @@ def normalize(
       values: [...].
       valid: [...], bool or 0/1.
       shards: How the samples are spread over devices.
-      ddof: The variance is divided by the number of samples minus this.
+      ddof: The variance is divided by the number of valid samples minus `ddof`.
       epsilon: Added to the deviation.
 
     Returns:

@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
 from swarmjax.extension import Network
 
-# Options that exist for one choice of another key: this key, and the choice.
+# Options that are read only with some choices of another key: by option, that key and the choices.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     "gae_lambda": ("advantage", ("gae",)),
     "memory_size": ("memory", ("gru",)),
@@ -22,23 +22,26 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 class AlgoConfig(Section):
     """Settings of PPO; names in quotes are those in Table 1 of the paper.
 
-    Some options are read with one choice of another key alone; their meanings name it in brackets.
+    Some options are read only with one choice of another key. Their texts end with this key and
+    choice, in brackets.
     """
 
     name: Literal["ppo", "paper"] = setting(
         "ppo", "preset that gave the first values", derived=True
     )
     policy: Literal["shared", "independent"] = setting(
-        "shared", "one policy for all agents, or one for each"
+        "shared", "shared: one policy for all robots; independent: one policy for each robot"
     )
     network: str | None = setting(
-        None, "network of actor and critic: mlp or an extension's; null: the extension's, if any"
+        None,
+        "network of actor and critic: mlp, or the name of a network in extensions; null: the "
+        "extension's network if it has one, otherwise mlp",
     )
     hidden_sizes: tuple[int, ...] = setting((64, 64), "widths of the hidden layers", 1, 4096)
     memory: Literal["none", "gru"] = setting(
-        "none", "memory of the robots; gru: a gated recurrent unit after the layers"
+        "none", "memory of the robots; gru: a gated recurrent unit after the hidden layers"
     )
-    memory_size: int = setting(64, "size of the memory [memory=gru]", 1, 1024)
+    memory_size: int = setting(64, "numbers in the memory of each network [memory=gru]", 1, 1024)
     critic: Literal["observation", "state"] = setting(
         "observation",
         "what the critic sees; state: also targets, other robots, walls, the distance to go "
@@ -52,12 +55,16 @@ class AlgoConfig(Section):
         "activation of the mean action; tanh: keeps the action within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
-        "orthogonal", "first weights; uniform: within 1 / sqrt(inputs), biases too, as in PyTorch"
+        "orthogonal",
+        "initial weights; uniform: weights and biases within +-1 / sqrt(inputs of the layer), "
+        "as in PyTorch",
     )
     normalize_observations: bool = setting(
-        True, "scale observations by their running mean and deviation; false: raw, clipped to +-10"
+        True,
+        "shift and scale observations by their running mean and standard deviation; false: use raw "
+        "observations; both are clipped to +-10",
     )
-    rollout_length: int = setting(32, "control steps per update", 1, MAX_COUNT)
+    rollout_length: int = setting(32, "control steps of each arena per update", 1, MAX_COUNT)
     epochs: int = setting(1, "passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
     num_minibatches: int = setting(8, "gradient steps per pass; must divide arenas", 1, MAX_COUNT)
     discount: float = setting(
@@ -65,62 +72,67 @@ class AlgoConfig(Section):
     )
     advantage: Literal["gae", "monte_carlo"] = setting(
         "gae",
-        "gae: bootstrapped, also at the step limit; monte_carlo: returns to the end of the "
-        "episode or rollout, normalised, for both critic and advantages",
+        "gae: generalised advantage estimation, bootstrapped also where the step limit ends an "
+        "episode; monte_carlo: the critic and the advantages use normalised returns up to the "
+        "end of the episode or rollout",
     )
     gae_lambda: float = setting(0.95, "GAE's lambda [advantage=gae]", 0.0, 1.0)
     clip_epsilon: float = setting(
-        0.2, "range of the probability ratio: 'PPO epsilon clip'", above=0.0
+        0.2, "largest deviation of the probability ratio from 1: 'PPO epsilon clip'", above=0.0
     )
     actor_learning_rate: float | None = setting(
         None,
-        "rate of the policy: 'optimizer learning rate actor'; null: 3e-4, reduced in "
-        "proportion in a run of more than 15000 gradient steps",
+        "learning rate of the policy: 'optimizer learning rate actor'; null: 3e-4, but in a run of "
+        "more than 15000 gradient steps less, in inverse proportion to their number",
         above=0.0,
         high=1.0,
     )
     critic_learning_rate: float | None = setting(
         None,
-        "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced in the same way",
+        "learning rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced by the "
+        "same factor as that of the policy",
         above=0.0,
         high=1.0,
     )
     learning_rate_schedule: Literal["constant", "linear"] = setting(
-        "linear", "linear falls to 0 at the end of the budget"
+        "linear", "linear: the rates fall to 0 at the end of the budget"
     )
     adam_epsilon: float = setting(1e-5, "added to the root of Adam's second moment", above=0.0)
     max_grad_norm: float | None = setting(
         0.5, "norm at which gradients are clipped; null: no clipping", above=0.0
     )
-    value_cost: float = setting(0.5, "weight of the value loss, half the mean squared error", 0.0)
-    entropy_cost: float = setting(0.0, "weight of the entropy", 0.0)
+    value_cost: float = setting(
+        0.5, "weight of the value loss, which is half the mean squared error", 0.0
+    )
+    entropy_cost: float = setting(0.0, "weight of the entropy bonus", 0.0)
     update_backend: Literal["auto", "autodiff"] = setting(
         "auto",
-        "how to compute gradients; auto: by GPU kernels if there is an NVIDIA GPU and they "
-        "support the layers; with a memory, by autodiff without the rollouts of absent robots",
+        "how to compute gradients; auto: by GPU kernels if there is an NVIDIA GPU and the kernels "
+        "support the layers; with a memory, by autodiff that leaves out the rollouts of absent "
+        "robots",
     )
     exploration: Literal["learned", "scheduled"] = setting(
-        "learned", "deviation of the action: learned, or falling in steps by a schedule"
+        "learned", "standard deviation of the action: learned, or falling in steps by a schedule"
     )
     initial_std: float = setting(
-        0.6, "first deviation: 'starting std of action distribution'", above=0.0
+        0.6, "initial standard deviation: 'starting std of action distribution'", above=0.0
     )
     std_decrement: float = setting(
         0.05,
-        "decrease of the deviation at a time: 'the decay rate of std of action distribution' "
-        "[exploration=scheduled]",
+        "how much the deviation falls at each step of the schedule: 'the decay rate of std of "
+        "action distribution' [exploration=scheduled]",
         above=0.0,
     )
     std_interval: int = setting(
         250_000,
-        "control steps of all arenas between decreases: 'decay frequency of std of action "
-        "distribution' [exploration=scheduled]",
+        "control steps, summed over all arenas, between two decreases of the deviation: 'decay "
+        "frequency of std of action distribution' [exploration=scheduled]",
         1,
         MAX_COUNT,
     )
     std_floor: float = setting(
         0.1,
-        "least deviation: 'minimum std of action distribution' [exploration=scheduled]",
+        "smallest deviation: 'minimum std of action distribution' [exploration=scheduled]",
         above=0.0,
     )
 
@@ -147,14 +159,15 @@ class AlgoConfig(Section):
 
 
 def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
-    """Returns the name of the network that a config means.
+    """Returns the name of the network that a config selects.
 
     Args:
       config: Names a network, or leaves the choice to the extension.
       networks: Networks of an extension.
 
     Raises:
-      ConfigError: The name is unknown, or the extension has several networks and none is named.
+      ConfigError: The name is unknown, or the extension has several networks and
+        the config names none of them.
     """
     names = [piece.name for piece in networks]
     if config.network is None and len(names) > 1:

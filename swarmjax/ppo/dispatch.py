@@ -12,13 +12,15 @@ from swarmjax.ppo.config import AlgoConfig
 from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Networks, Sizes
 
-# XLA runs Triton's kernels from this generation on (Ampere, compute capability 8).
+# XLA runs Triton's kernels on NVIDIA GPUs of this compute capability or later (8 is Ampere).
 _LEAST_GENERATION = 8
-# JAX's names for products without tensor cores (`jax.default_matmul_precision`).
+# JAX's names for matrix products without tensor cores
+# (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: `ppo` alone. blocks: autodiff of a whole batch, block by block. fused: kernels.
-# sequences: autodiff of a policy with memory, without the sequences of absent robots.
+# autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block.
+# fused: GPU kernels. sequences: autodiff of a policy with memory, without the sequences of absent
+# robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
 Learn = Callable[[Learning, Progress, Batch, jax.Array], tuple[Progress, Metrics]]
 
@@ -26,20 +28,20 @@ Learn = Callable[[Learning, Progress, Batch, jax.Array], tuple[Progress, Metrics
 def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
     """Chooses how updates are computed on the device that JAX computes on.
 
-    `auto` means `fused` on a GPU that supports the kernels and for layers that the kernels support.
-    A CPU processes a whole batch in `blocks`; an accelerator processes it at once. A policy with
-    memory is trained in `sequences` on any device.
+    `auto` means `fused` if the GPU supports the kernels and the kernels support the layers. If the
+    whole batch is one minibatch, a CPU processes it in `blocks`, and an accelerator processes it at
+    once. With `auto`, a policy with memory is trained in `sequences` on any device.
 
     Args:
       config: Settings of the learner.
       networks: Actor and critic.
-      sizes: What they see and do.
+      sizes: Sizes of what the networks see and do.
 
     Returns:
       The backend.
     """
     auto = config.update_backend == "auto"
-    if config.memory != "none":  # the other faster ways handle single samples
+    if config.memory != "none":  # other faster ways ignore the order of samples
         return "sequences" if auto else "autodiff"
     if auto and _fuses(config, networks, sizes):
         return "fused"
@@ -48,10 +50,14 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
 
 
 def memory_kernels(config: AlgoConfig) -> Any:
-    """Returns the kernels that compute a memory; None without memory or a GPU that supports them.
+    """Chooses the kernels that compute a memory.
 
     Args:
       config: Settings of the learner.
+
+    Returns:
+      The module of the kernels. None if the policy has no memory, if `update_backend` is
+      `autodiff`, or if the kernels do not support the memory or the device.
     """
     asked = config.memory != "none" and config.update_backend == "auto"
     if not asked or not _runs_kernels():
@@ -79,7 +85,8 @@ def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
 def _runs_kernels() -> bool:
     """Tells whether kernels are faster than XLA's code on the device that JAX computes on.
 
-    They need an NVIDIA GPU whose tensor cores Triton supports, and products that may use them.
+    The kernels need an NVIDIA GPU whose tensor cores Triton supports, and a precision of matrix
+    products that allows tensor cores.
     """
     capability = str(getattr(jax.devices()[0], "compute_capability", ""))
     generation = re.fullmatch(r"(\d+)\.\d+", capability)

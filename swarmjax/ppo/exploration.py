@@ -14,7 +14,7 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
     `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
 
     Args:
-      config: With `exploration` scheduled.
+      config: Settings with `exploration=scheduled`.
 
     Returns:
       At least one deviation, in action units.
@@ -30,14 +30,15 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
 
 
 def scheduled_std(config: AlgoConfig, step: jax.Array) -> jax.Array:
-    """Looks up the deviation of a control step.
+    """Looks up the deviation at a control step.
 
     Args:
-      config: With `exploration` scheduled.
-      step: [...], int32, how many control steps came before, at least 0.
+      config: Settings with `exploration=scheduled`.
+      step: [...], int32, how many control steps came before this one, at least 0.
 
     Returns:
-      The deviation, [...]: the first level for steps 0 to `std_interval` - 1, and so on.
+      The deviation, [...]: the first of `scheduled_stds` for steps 0 to `std_interval` - 1, the
+      second for the next `std_interval` steps, and so on.
     """
     table = jnp.asarray(scheduled_stds(config), dtype=float)
     return table[jnp.minimum(step // config.std_interval, table.shape[0] - 1)]

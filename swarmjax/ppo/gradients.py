@@ -1,7 +1,7 @@
 """One gradient step: the PPO loss of a minibatch, and the optimiser's step along its gradient.
 
-A minibatch has B samples. Invalid ones are finite and do not count. Actions are drawn from a
-diagonal Gaussian; U is the size of an action.
+A minibatch has B samples. Invalid samples are finite and do not affect the loss. Actions are
+sampled from a diagonal Gaussian; U is the size of an action.
 """
 
 import math
@@ -20,11 +20,11 @@ from swarmjax.shards import ALONE, Shards
 Metrics = dict[str, jax.Array]
 Progress = tuple[Params, optax.OptState]
 
-# Weight of the bound term. With 1, robots that block each other did so for ever (docs/results.md,
-# "The mean action was worse because the bound was too weak").
+# Weight of the bound term. With a weight of 1, robots that blocked each other did so for ever
+# (docs/results.md, "The mean action was worse because the bound was too weak").
 BOUND_COST = 1500.0
-# Weight of the guess of the state that the critic sees. With it, five policies solved 98.1 % of
-# the levels of `worlds`, without it 97.3 %.
+# Weight of the guess term, the error of the actor's guess of the state that the critic sees. Five
+# policies trained with this term solved 98.1 % of the levels of `worlds`, and without it 97.3 %.
 GUESS_COST = 0.02
 
 
@@ -66,28 +66,28 @@ def ppo_loss(
     section 3.4).
 
     The bound term is the squared distance of the mean action from -1..1, summed over the action.
-    This term follows `bounds_loss` of rl_games, which begins at 1.1. If the mean lies several
-    deviations beyond the range, all drawn actions have the same effect, and the policy learns
-    nothing from them.
+    This term follows `bounds_loss` of rl_games, where the range ends at 1.1. If the mean lies
+    several deviations beyond the range, all sampled actions have the same effect, and the policy
+    learns nothing from them.
 
     The guess term is the squared error of the actor's guess of the state, summed over its numbers.
 
     Each term is a sum over the valid samples divided by `expected_valid`. Every valid sample of a
-    batch then has the same weight, even if the minibatches are filled unevenly. The mean over the
-    minibatches is exactly the mean over the batch.
+    batch then has the same weight, even if the minibatches are filled unevenly. The mean of
+    a term over the minibatches is exactly its mean over the valid samples of the batch.
 
     Args:
       params: Parameters of the actor and the critic.
-      minibatch: samples, with normalised observations.
+      minibatch: Samples, with normalised observations.
       networks: Actor and critic.
       config: Clip range and costs.
-      expected_valid: [], valid samples of the whole batch / number of minibatches; at least 1 is
-        used.
+      expected_valid: [], valid samples of the whole batch / number of minibatches; a value below 1
+        is used as 1.
 
     Returns:
-      The loss [] and its parts, each [] and weighted in the same way: `policy_loss`,
-      `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at least 0),
-      `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
+      The loss [] and its parts before their costs, each [] and divided by `expected_valid` as
+      described: `policy_loss`, `value_loss`, `bound_loss`, `entropy` (nats), `approx_kl` (nats, at
+      least 0), `clip_fraction` (0..1) and, if the critic sees the state, `guess_loss`.
     """
     vectors = (minibatch.observation, minibatch.action)
     numbers = (minibatch.log_prob, minibatch.advantage, minibatch.return_, minibatch.valid)
@@ -137,7 +137,7 @@ def _terms(
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Batch) -> tuple[Acted, jax.Array]:
-    """Runs actor and critic on samples, step by step with a memory; returns also the value [B]."""
+    """Runs actor and critic on samples, with a memory step by step; returns both outputs."""
     seen, state, memory = minibatch.observation, minibatch.state, minibatch.memory
     begins = minibatch.begins
     if begins is not None:
@@ -158,7 +158,7 @@ def beyond_range(mean: jax.Array) -> jax.Array:
     """Computes how far a mean action lies beyond the range of commands.
 
     Args:
-      mean: [B, U], -1..1 spans the commands.
+      mean: [B, U]; -1..1 is the range of commands.
 
     Returns:
       [B, U]: 0 within the range, negative below it, positive above it.
@@ -172,7 +172,7 @@ def log_density(mean: jax.Array, std: jax.Array, action: jax.Array) -> jax.Array
     Args:
       mean: [B, U].
       std: [U], above 0.
-      action: [B, U], as drawn, before any clipping.
+      action: [B, U], as sampled, before any clipping.
 
     Returns:
       The log density summed over U, [B].
@@ -202,24 +202,25 @@ def take(
 ) -> tuple[Progress, Metrics]:
     """Takes a step along a gradient, unless no sample is valid.
 
-    Devices add up their gradients and metrics, and take the same step.
+    Devices add up their gradients and metrics, and all of them take the same step.
 
     A step is skipped, and counted, if its gradient or its result is not finite.
     `optax.apply_if_finite` is not enough: it checks the gradient alone, so a broken optimiser state
-    would break the parameters. After some skipped steps it also takes a step that is not finite.
+    would break the parameters. After some skipped steps in a row, `apply_if_finite` also
+    takes a step that is not finite.
 
     Args:
       learning: The optimiser, and how the samples are spread over devices.
       progress: Parameters and the optimiser's state before.
       found: The gradient, and the metrics of its loss.
-      any_valid: [], whether the gradient includes a valid sample.
+      any_valid: [], whether any sample that the gradient includes is valid.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics with `grad_norm`, `taken_steps`
-      and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
+      Parameters and the optimiser's state after, and the metrics of the loss plus `grad_norm`,
+      `taken_steps` and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
     """
     params, optimizer_state = progress
-    # One sum for all: on several devices each sum takes tens of microseconds, whatever its size.
+    # One sum of all values: on several devices, each sum takes tens of microseconds at any size.
     (gradient, metrics), devices = learning.shards.sum((found, any_valid.astype(jnp.float32)))
     any_valid = devices > 0.0
     metrics["grad_norm"] = optax.tree.norm(gradient)
@@ -247,12 +248,12 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
 
     Returns:
       The means over the steps taken, [], and the number of `skipped_steps`. If no step was taken
-      but some were skipped, the means are -inf. If none was skipped either, the means are 0.
+      but some were skipped, the means are -inf. If no step was taken or skipped, they are 0.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
     # Exactly 1 if all steps of the update were taken.
     share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
-    # Not NaN: JAX_DEBUG_NANS would take it for a mistake.
+    # Lost means are -inf and not NaN, because JAX_DEBUG_NANS would stop at a NaN.
     lost = (taken == 0) & (skipped > 0)
     means = {n: jnp.where(lost, -jnp.inf, jnp.mean(x) * share) for n, x in metrics.items()}
     del means["taken_steps"]

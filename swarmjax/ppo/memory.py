@@ -1,11 +1,12 @@
 """The memory of a policy: a gated recurrent unit (GRU) between the hidden layers and the heads.
 
 Cho et al. 2014, "Learning Phrase Representations using RNN Encoder-Decoder", section 2.3. The reset
-gate comes after the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
+gate is applied after the recurrent product, as in cuDNN, PyTorch, Flax and ONNX
 (`linear_before_reset=1`). The heads see both the hidden layers' features and the memory, so they
 can ignore the memory.
 
-B stands for any number of leading axes, T for control steps, F for features, H for the memory.
+B stands for any number of leading axes, T for control steps, F for the number of features, H for
+the width of the memory.
 """
 
 import functools
@@ -21,9 +22,9 @@ from flax import linen as nn
 # orthogonal for recurrent weights, no bias.
 _INPUT = nn.initializers.lecun_normal()
 
-# Steps of a sequence in one iteration of its loop: on a GPU each iteration launches its own
-# kernels. Compared with 1 step, an update takes at most half a second longer to compile with 4
-# steps, and a second longer with 8 steps.
+# How many steps of a sequence one iteration of the loop computes: on a GPU each iteration launches
+# its own kernels. Compared with 1 step, an update takes at most half a second longer to compile
+# with 4 steps, and a second longer with 8 steps.
 _UNROLL = 4
 
 
@@ -42,7 +43,7 @@ class Gru(nn.Module):
 
     Attributes:
       size: H.
-      uniform: Whether weights and biases begin within 1 / sqrt(H), as in PyTorch's GRU
+      uniform: Whether weights and biases begin within +-1 / sqrt(H), as in PyTorch's GRU
         (`torch.nn.RNNBase.reset_parameters`).
       kernels: Module with `remember` and `remember_all`, which replace the functions of this file
         on a GPU. None means that XLA computes them.
@@ -59,10 +60,10 @@ class Gru(nn.Module):
         """Updates the memory with one observation, or with a sequence of them.
 
         Args:
-          features: [B, F], or [T, B, F] of a sequence.
-          memory: [B, H] before.
-          begins: [T, B] of a sequence, whether an episode begins with this step. The memory is
-            then cleared first.
+          features: [B, F], or [T, B, F] for sequences.
+          memory: [B, H], memory before the first observation.
+          begins: [T, B], whether an episode begins with the step; the memory is then cleared before
+            the step. None for a single observation.
 
         Returns:
           The memory [.., H] after each observation, for the heads, and the memory [B, H] after
@@ -84,7 +85,7 @@ class Gru(nn.Module):
     def _by_kernels(
         self, features: jax.Array, memory: jax.Array, begins: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
-        """Does what a call does, but with the kernels."""
+        """Does what `__call__` does, but with the kernels."""
         layers = self.variables["params"]
         if begins is None:
             memory = self.kernels.remember(layers, features, memory)
@@ -113,10 +114,10 @@ def remember(seen: jax.Array, recalled: jax.Array, memory: jax.Array) -> jax.Arr
     Args:
       seen: [B, 3 H], input weights times features, with their bias.
       recalled: [B, 3 H], recurrent weights times memory, with their bias.
-      memory: [B, H] before.
+      memory: [B, H], memory before the observation.
 
     Returns:
-      The memory [B, H] after, within -1..1.
+      The memory [B, H] after the observation, within -1..1.
     """
     reset, update, candidate = jnp.split(seen, 3, axis=-1)
     reset_, update_, candidate_ = jnp.split(recalled, 3, axis=-1)
@@ -131,16 +132,16 @@ def remember_all(
 ) -> jax.Array:
     """Computes the memory after each observation of sequences.
 
-    Its gradient follows that of `remember`. Only terms that depend on the next step are computed
-    step by step. Autodiff would also sum the gradient of `kernel` step by step, from products that
-    fill a small part of a GPU.
+    Its gradient is built from the gradient of `remember`. Only terms that depend on the next step
+    are computed step by step. Autodiff would also sum the gradient of `kernel` step by step, from
+    products that are too small to fill a GPU.
 
     Args:
       kernel: [H, 3 H], recurrent weights.
       bias: [3 H], recurrent bias.
       seen: [T, B, 3 H], as for `remember`.
       begins: [T, B], whether an episode begins with the step.
-      memory: [B, H] before the first step.
+      memory: [B, H], memory before the first step.
 
     Returns:
       The memory [T, B, H] after each step.

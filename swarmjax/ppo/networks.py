@@ -1,6 +1,7 @@
 """Actor and critic networks, and the running moments that normalise what they see.
 
-B stands for any number of leading axes, O for the observation and U for the action.
+B stands for any number of leading axes, O for the size of an observation and U for the size of an
+action.
 """
 
 import functools
@@ -27,13 +28,14 @@ _ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 
 # Gains of the orthogonal initialisation: Huang et al. 2022, "The 37 Implementation Details of
-# Proximal Policy Optimization", core detail 2. Their gain is 1 for the critic, because they scale
-# rewards to a return of about 1. Our returns are metres. A critic that begins between -1 and 1 is
-# wrong by more than a robot can earn, and the policy follows the critic's errors (docs/results.md,
-# "Why seeds were slow").
+# Proximal Policy Optimization", core detail 2. Their gain for the critic's output is 1, because
+# they scale rewards to a return of about 1. Our returns are in metres. A critic whose
+# values begin between -1 and 1 is wrong by more than a robot can earn, and the policy follows the
+# critic's errors (docs/results.md, "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
-# An observation that has hardly varied yet is magnified by at most 1 / this.
+# Least standard deviation to divide an observation by: one that has hardly varied yet is magnified
+# by at most 1 / MIN_STD.
 MIN_STD = 1e-3
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
 # continuous-action detail 7: bound of normalised observations.
@@ -58,17 +60,17 @@ class Sizes(NamedTuple):
 class Normalizer:
     """Mean and variance of the observations seen so far.
 
-    Brax's `running_statistics` loads MuJoCo, MJX and Warp. It also divides 0 by 0 if the first
-    batch has no valid sample, which happens to a learner whose robots are still absent.
+    It replaces Brax's `running_statistics`, which loads MuJoCo, MJX and Warp, and divides 0 by 0 if
+    the first batch has no valid sample. That happens to a learner whose robots are still absent.
 
     Attributes:
       count: [], float32, number of observations. Beyond 2**24 it is rounded. This is harmless,
         because the count only weighs a batch against the past, and a relative error of 2**-24 is
         negligible.
       mean: [O].
-      variance: [O], of the population; 1 before the first observation.
-      rest: [2, O], what rounding to float32 has taken from mean and variance. After a million
-        updates, a batch moves them by less than float32 can hold.
+      variance: [O], population variance; 1 before the first observation.
+      rest: [2, O], what rounding to float32 has taken from `mean` and from `variance`. It is kept
+        because, after a million updates, one batch moves both by less than float32 can resolve.
     """
 
     count: jax.Array
@@ -83,7 +85,7 @@ class Normalizer:
 
     @classmethod
     def init(cls, observation_size: int) -> "Normalizer":
-        """Returns a new normalizer, which changes nothing yet."""
+        """Returns a new normalizer, which only clips observations until its first update."""
         return cls(
             count=jnp.zeros((), jnp.float32),
             mean=jnp.zeros((observation_size,), jnp.float32),
@@ -102,7 +104,7 @@ class Normalizer:
     ) -> "Normalizer":
         """Adds a batch of observations.
 
-        It merges the moments of two sets as in Chan, Golub and LeVeque 1983, "Algorithms for
+        The moments of two sets are merged as in Chan, Golub and LeVeque 1983, "Algorithms for
         Computing the Sample Variance: Analysis and Recommendations". The batch's own moments take
         two passes, which avoids subtracting large squares.
 
@@ -112,7 +114,7 @@ class Normalizer:
           shards: how the observations are spread over devices.
 
         Returns:
-          The moments of all observations; unchanged if none is valid.
+          The moments of all observations so far; unchanged if no observation is valid.
         """
         chex.assert_shape(observation, (*valid.shape, *self.mean.shape))
         axes = tuple(range(valid.ndim))
@@ -142,7 +144,8 @@ class Normalizer:
 def _add(total: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Adds two numbers; also returns what rounding takes from the sum.
 
-    Together, both are exact: Knuth, "The Art of Computer Programming" 2, section 4.2.2, theorem B.
+    The two results add up to the exact sum: Knuth, "The Art of Computer Programming" 2, section
+    4.2.2, theorem B.
     """
     new = total + change
     taken = new - total
@@ -164,10 +167,10 @@ class _Torso(nn.Module):
 
 
 class _Head(nn.Module):
-    """An affine layer of the features and, if there is one, the memory.
+    """An affine layer; its inputs are the features and, if there is one, the memory.
 
     Features and memory are multiplied by different rows of one kernel, so they need not be copied
-    side by side.
+    into one array.
     """
 
     config: AlgoConfig
@@ -190,7 +193,7 @@ class Acted(NamedTuple):
     Attributes:
       mean: [B, U], mean action.
       std: [U], standard deviation of the action.
-      memory: [B, H], memory after; () without memory.
+      memory: [B, H], memory after the observation; () without memory.
       guess: [B, P], guess of the state that the critic sees; () if the critic sees no state.
     """
 
@@ -201,13 +204,15 @@ class Acted(NamedTuple):
 
 
 class _Network(nn.Module):
-    """The layers that actor and critic have in common: what a head sees of an observation.
+    """The kinds of layers that both actor and critic have: from an observation to the features.
+
+    The heads take the features. Actor and critic do not share weights.
 
     Attributes:
       config: settings of the layers.
       sizes: what a policy sees and does.
-      torso: an extension's network, in place of the hidden layers; None for these.
-      kernels: what computes a memory on a GPU, as in `Gru`.
+      torso: an extension's network, in place of the hidden layers; None means hidden layers.
+      kernels: module that computes a memory on a GPU, as in `Gru`.
     """
 
     config: AlgoConfig
@@ -218,7 +223,7 @@ class _Network(nn.Module):
     def _features(
         self, seen: jax.Array, memory: Any, begins: jax.Array | None
     ) -> tuple[tuple[jax.Array, ...], Any]:
-        """Returns the features for the heads, and the memory after."""
+        """Returns the features for the heads, and the memory after the observation."""
         make = self.torso or functools.partial(_Torso, self.config)
         features = make(name="torso")(seen)
         if self.config.memory == "none":
@@ -235,16 +240,17 @@ class _Network(nn.Module):
 class _Actor(_Network):
     """Mean (`mean`) and logarithm of the standard deviation (`log_std`) of the action.
 
-    The action is a diagonal Gaussian. Its mean is within -1..1 if the output is tanh, otherwise
-    unbounded. Its deviation does not depend on the observation, and has no gradient if it is
-    scheduled.
+    The action is a diagonal Gaussian. Its mean is within -1..1 if `mean_activation` is tanh,
+    otherwise unbounded. Its deviation does not depend on the observation, and has no gradient if
+    exploration is scheduled.
 
     If the critic sees a state, the actor also guesses it (`guess`). The guess is not used for
     acting. Its error trains the memory to hold what a robot can know about its surroundings
     (Mirowski et al. 2017, "Learning to Navigate in Complex Environments", section 3).
 
-    Observations are [B, O], or [T, B, O] of sequences. The memory before is [B, H], or () without
-    memory. Of sequences, `begins` [T, B] tells whether an episode begins with the step.
+    Observations are [B, O], or [T, B, O] for sequences of T steps. The memory before the first
+    observation is [B, H], or () without memory. For sequences, `begins` [T, B] tells whether an
+    episode begins with the step.
     """
 
     @nn.compact
@@ -268,9 +274,9 @@ class _Actor(_Network):
 
 
 class _Critic(_Network):
-    """Value (`value`) [B] of an observation and of the state [B, P], () if the critic sees none.
+    """Value (`value`) [B] of an observation and a state: the expected discounted return.
 
-    It is the expected discounted return. Memory and `begins` are as for `_Actor`.
+    The state is [B, P], or () if the critic sees no state. Memory and `begins` are as for `_Actor`.
     """
 
     @nn.compact
@@ -290,7 +296,8 @@ def _initializers(config: AlgoConfig, inputs: int, gain: float) -> tuple[Any, An
     """Returns initialisers of kernel and bias of a layer; `gain` is for orthogonal kernels."""
     if config.initialization == "orthogonal":
         return nn.initializers.orthogonal(gain), nn.initializers.zeros_init()
-    # `torch.nn.Linear.reset_parameters` does the same: the bound of both is 1 / sqrt(inputs).
+    # `torch.nn.Linear.reset_parameters` does the same: kernel and bias have the bound
+    # 1 / sqrt(inputs).
     within = functools.partial(uniform, bound=1.0 / math.sqrt(inputs))
     return within, within
 
@@ -328,7 +335,7 @@ class Networks(NamedTuple):
         }
 
     def begin_memory(self, shape: tuple[int, ...]) -> Recall:
-        """Returns the memory [*shape, H] of episodes that begin; () each without memory."""
+        """Returns actor's and critic's memory at the start of episodes: [*shape, H], or ()."""
         config = self.actor.config
         if config.memory == "none":
             return NO_MEMORY
@@ -336,11 +343,11 @@ class Networks(NamedTuple):
         return Recall(zero, zero)
 
     def act(self, params: Params, *seen: Any) -> Acted:
-        """Runs the actor; `seen` as `_Actor` takes it, with normalised observations."""
+        """Runs the actor; `seen` holds what `_Actor` takes, with normalised observations."""
         return cast("Acted", self.actor.apply({"params": params["actor"]}, *seen))
 
     def value(self, params: Params, *seen: Any) -> tuple[jax.Array, Any]:
-        """Runs the critic; `seen` as `_Critic` takes it, with normalised observations."""
+        """Runs the critic; `seen` holds what `_Critic` takes, with normalised observations."""
         value = self.critic.apply({"params": params["critic"]}, *seen)
         return cast("tuple[jax.Array, Any]", value)
 
@@ -354,13 +361,13 @@ def make(
       config: settings of the layers. It may name a network, or leave the choice to the extension.
       sizes: what the policy sees and does.
       pieces: networks of an extension.
-      kernels: what computes a memory on a GPU, as in `Gru`.
+      kernels: module that computes a memory on a GPU, as in `Gru`.
 
     Returns:
       The networks.
 
     Raises:
-      ConfigError: the network is missing, or does not return features.
+      ConfigError: the network that the config names is missing, or does not return features.
     """
     torso = own_network.load(config, pieces, sizes.observation, sizes.state)
     parts = (config, sizes, torso, kernels)

@@ -4,9 +4,10 @@ import optax
 
 from swarmjax.ppo.config import AlgoConfig
 
-# The rule of `learning_rates`. Runs of 128 to 8,192 arenas ended well if the sum of their rates
-# over all gradient steps equalled that of 6,000 to 15,000 steps whose rates fall from 3e-4 to 0.
-# Larger sums ended worse (docs/results.md, "Why more training made the swarm worse").
+# Numbers for `learning_rates`. Runs of 128 to 8,192 arenas ended well if the sum of their learning
+# rates over all gradient steps was as large as the sum over 6,000 to 15,000 steps whose rates fall
+# from 3e-4 to 0. Runs with larger sums ended worse (docs/results.md, "Why more training made the
+# swarm worse").
 _RATES = {"actor": 3e-4, "critic": 1e-3}
 _FULL_RATE_STEPS = 15_000
 # Mean over the run of the factor that a schedule applies to a rate.
@@ -17,7 +18,7 @@ def gradient_steps(config: AlgoConfig, updates: int) -> int:
     """Counts the gradient steps of a run, including those without a valid sample.
 
     Args:
-      config: Passes over each rollout, and minibatches of each pass.
+      config: Gives the passes over each rollout, and the minibatches of each pass.
       updates: Number of updates of the whole run.
     """
     return updates * config.epochs * config.num_minibatches
@@ -27,11 +28,11 @@ def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
     """Chooses the learning rates that a run begins with.
 
     A rate that is null in the config becomes its value in `_RATES` times a share of at most 1. The
-    share limits the sum of the rates over the run. The limit is the sum over `_FULL_RATE_STEPS`
-    steps whose rates fall linearly to 0.
+    share limits the sum of the rates over all steps of the run. The limit is the sum over
+    `_FULL_RATE_STEPS` steps whose rates fall linearly from that value to 0.
 
     Args:
-      config: Learning rates, or None for the rule; their schedule.
+      config: Learning rates, each None if this function is to choose it, and their schedule.
       updates: Number of updates of the whole run.
 
     Returns:
@@ -45,11 +46,11 @@ def learning_rates(config: AlgoConfig, updates: int) -> dict[str, float]:
 
 
 def make(config: AlgoConfig, updates: int) -> optax.GradientTransformation:
-    """Makes the optimiser: one clip over all gradients, if any, then Adam for each network.
+    """Makes the optimiser: it clips the norm of all gradients, then Adam updates each network.
 
     Args:
       config: Learning rates, their schedule, and the norm at which gradients are clipped.
-      updates: Number of updates of the whole run: the learning rate's horizon.
+      updates: Number of updates of the whole run, over which a linear schedule falls to 0.
 
     Returns:
       An optimiser for `{"actor": .., "critic": ..}`.

@@ -1,4 +1,4 @@
-"""An extension's network in place of the hidden layers: its checks."""
+"""Loads and checks an extension's network, which replaces the hidden layers."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,13 +13,13 @@ from swarmjax.ppo.config import AlgoConfig, resolve
 
 
 def load(config: AlgoConfig, networks: Sequence[Network], observation: int, state: int) -> Any:
-    """Returns the class of the network that a config means; None for hidden layers.
+    """Returns the class of the network that a config selects; None means hidden layers.
 
     Args:
       config: as for `resolve`.
       networks: as for `resolve`.
-      observation: O.
-      state: P, numbers that the critic sees in addition.
+      observation: O, the size of an observation.
+      state: P, how many numbers the critic sees in addition to an observation.
 
     Raises:
       ConfigError: the network is missing, fails or does not return features.

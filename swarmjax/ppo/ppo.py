@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (PPO) of one learner: how it acts, values and learns.
+"""Proximal policy optimisation (PPO) of one learner: how it acts, computes values and learns.
 
 All functions are pure and handle one learner; for L learners, apply `jax.vmap` over state, batch
 and key. G stands for groups of samples, N for the samples of a group. Minibatches consist of whole
@@ -36,7 +36,7 @@ class LearnerState:
 
     Attributes:
       params: `{"actor": .., "critic": ..}`.
-      optimizer_state: State of the optimiser that `init` made.
+      optimizer_state: State of the optimiser, `PPO.learning.optimizer`.
       normalizer: Moments of the valid observations of all updates so far. A learner that does not
         normalise keeps the initial moments.
       explored: [], int32, control steps that the schedule of exploration has counted, at most
@@ -55,7 +55,7 @@ class PPO:
 
     Attributes:
       learning: settings, networks and optimiser.
-      sizes: what the policy sees and does.
+      sizes: sizes of what the policy sees and does.
       backend: how updates are computed.
     """
 
@@ -78,7 +78,7 @@ class PPO:
 
         Args:
           config: settings.
-          sizes: what the policy sees and does.
+          sizes: sizes of what the policy sees and does.
           updates: number of updates of the whole run, at least 1; the learning rate's schedule
             spans them.
           pieces: networks of an extension.
@@ -86,7 +86,7 @@ class PPO:
           side_by_side: how many learners a device trains at once.
 
         Raises:
-          ConfigError: the network is missing or does not fit, or the backend is not available.
+          ConfigError: the network that the config names is missing or does not fit.
         """
         nets = networks.make(config, sizes, pieces, dispatch.memory_kernels(config))
         adam = optimizer.make(config, updates)
@@ -110,23 +110,23 @@ class PPO:
         )
 
     def begin_memory(self, shape: tuple[int, ...]) -> Recall:
-        """Returns the memory [*shape, H] of episodes that begin; () each without memory."""
+        """Returns actor's and critic's memory at the start of episodes: [*shape, H], or ()."""
         return self.learning.networks.begin_memory(shape)
 
     def act(
         self, learner: LearnerState, observation: jax.Array, noise: jax.Array, memory: Any = ()
     ) -> tuple[jax.Array, jax.Array, Any]:
-        """Draws actions.
+        """Samples actions.
 
         Args:
           learner: the learner with the policy.
           observation: [..., O], raw.
           noise: [..., U], standard normal; 0 gives the most likely action.
-          memory: [..., H], memory of the actor before; () without memory.
+          memory: [..., H], the actor's memory before the observation; () without memory.
 
         Returns:
-          The action mean + std * noise, [..., U], unbounded, its log density, [...], and the memory
-          after.
+          The action, mean + std * noise, [..., U], which is unbounded; its log density, [...]; and
+          the actor's memory after the observation.
         """
         seen = learner.normalizer.normalize(observation)
         acted = self.learning.networks.act(learner.params, seen, memory)
@@ -144,10 +144,10 @@ class PPO:
           observation: [..., O], raw.
           state: [..., P], numbers of order 1 that the critic sees in addition; () if there are
             none.
-          memory: [..., H], memory of the critic before; () without memory.
+          memory: [..., H], the critic's memory before the observation; () without memory.
 
         Returns:
-          The expected discounted return, [...], and the memory after.
+          The expected discounted return, [...], and the critic's memory after the observation.
         """
         seen = learner.normalizer.normalize(observation)
         return self.learning.networks.value(learner.params, seen, state, memory)
@@ -157,23 +157,25 @@ class PPO:
 
         Args:
           trajectory: [T, A, N, ...].
-          memory: [A, N, H], memory before the rollout; () each without memory.
+          memory: Memories of actor and critic before the rollout, each [A, N, H], or () without
+            memory.
           over: [T, A], whether an arena's episode ended with the step.
 
         Returns:
-          A groups with T * N samples.
+          A batch of A groups, each with T * N samples.
         """
         return batches.make(trajectory, memory, over, self.config, self.learning.shards)
 
     def update(
         self, learner: LearnerState, batch: Batch, key: jax.Array
     ) -> tuple[LearnerState, Metrics]:
-        """Learns from one batch: `config.epochs` passes in `config.num_minibatches` steps each.
+        """Learns from one batch in `config.epochs` passes of `config.num_minibatches` steps.
 
-        The log densities in the batch were computed with the normalizer from before this update.
-        All epochs use this normalizer, so that the ratio of new to old density starts at 1. After
-        the epochs, the batch's observations are added to the normalizer. A minibatch without a
-        valid sample is skipped: it changes neither the parameters nor the learning rate's schedule.
+        The log densities in the batch were computed with the normalizer as it was before this
+        update. All epochs use the same normalizer, so that the ratio of new to old density starts
+        at 1. After the epochs, the batch's observations are added to the normalizer. A minibatch
+        without a valid sample is skipped: it changes neither the parameters nor the learning rate's
+        schedule.
 
         Args:
           learner: the learner before the update.
@@ -181,10 +183,10 @@ class PPO:
           key: random key, consumed.
 
         Returns:
-          The state after, the same on all devices, and metrics, each []. The metrics of
-          `gradients.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
-          `skipped_steps` counts the steps that were not finite. `std` is the policy's mean
-          deviation after the update.
+          The learner after the update, the same on all devices, and metrics, each []. The metrics
+          of `gradients.ppo_loss` and `grad_norm` (before clipping) are means over the steps taken.
+          `skipped_steps` counts the steps that were skipped because a number was not finite. `std`
+          is the action's standard deviation after the update, averaged over the action's numbers.
         """
         config, shards = self.config, self.learning.shards
         _check(config, batch, shards)
@@ -194,7 +196,7 @@ class PPO:
         begun = (learner.params, learner.optimizer_state)
         learn = _learn if self.backend == "autodiff" else dispatch.find(self.backend)
         (params, optimizer_state), metrics = learn(self.learning, begun, samples, key)
-        # Without a finite sample no step is finite either.
+        # If the batch had valid samples but none of them is finite, all its steps count as skipped.
         lost = shards.any(jnp.any(counted)) & ~shards.any(jnp.any(batch.valid))
         metrics["skipped_steps"] = jnp.where(lost, 1.0, metrics["skipped_steps"])
         metrics = gradients.mean_of_taken(metrics)
@@ -211,15 +213,15 @@ class PPO:
 
         Args:
           learner: the learner before these steps, with any leading axes.
-          steps: [], how many control steps of all arenas follow, at least 1.
+          steps: [], how many control steps follow, summed over all arenas, at least 1.
 
         Returns:
-          The learner with the deviation of the last of these steps; unchanged if exploration is
-          learned.
+          The learner with the deviation that the schedule gives for the last of these steps; the
+          same learner if exploration is learned.
         """
         if learner.explored is None:
             return learner
-        # The count stays at its largest value, since a run may go on from another one's count.
+        # The count stops at MAX_COUNT: a run that continues another run's count may exceed it.
         explored = jnp.minimum(learner.explored, MAX_COUNT - steps) + steps
         std = exploration.scheduled_std(self.config, explored - 1)
         return replace(_with_log_std(learner, jnp.log(std)[..., None]), explored=explored)
@@ -227,7 +229,7 @@ class PPO:
     def begin_again(
         self, learner: LearnerState, *, optimizer: bool, exploration: bool
     ) -> LearnerState:
-        """Resets parts of a learner, with any leading axes, to those of a new learner.
+        """Resets parts of a learner, with any leading axes, to what a new learner has.
 
         Args:
           learner: the learner.
@@ -236,7 +238,7 @@ class PPO:
           exploration: Whether to reset the deviation and its schedule.
 
         Returns:
-          The learner; itself if nothing is reset.
+          The changed learner; the given object itself if nothing is reset.
         """
         if optimizer:
             state = jax.tree.map(_without_moments, learner.optimizer_state, is_leaf=_is_adam)
@@ -297,7 +299,7 @@ def _samples(learner: LearnerState, config: AlgoConfig, batch: Batch, shards: Sh
 def _learn(
     learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
-    """Takes all gradient steps, epoch after epoch; returns the metrics of each step."""
+    """Takes all gradient steps, epoch after epoch; also returns the metrics of each step."""
     config, shards = learning.config, learning.shards
     expected_valid = shards.sum(jnp.sum(samples.valid)) / config.num_minibatches
 
@@ -328,7 +330,7 @@ def _gather(samples: Batch, rows: jax.Array, config: AlgoConfig) -> Batch:
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
-    """Deals this device's groups [G] out to M minibatches, [M, G / M], each stream by itself."""
+    """Deals this device's G groups out to minibatches, [M, G / M], within each random stream."""
     streams = shards.local_streams
     size = groups // streams
 

@@ -1,6 +1,6 @@
-"""Faster ways to compute the same update. They are optional: only `ppo/dispatch.py` calls them.
+"""Faster ways to compute the update of `ppo.py`. Only `ppo/dispatch.py` calls them; none is needed.
 
-`fused.py` learns with kernels on an NVIDIA GPU. `blocks.py` splits a whole batch
-on a CPU into blocks that fit a core's cache. `sequences.py` trains policies with memory, and leaves
-out the sequences without a valid sample.
+`fused.py` learns with kernels on an NVIDIA GPU. On a CPU, `blocks.py` splits a batch that is one
+minibatch into blocks that fit a core's cache. `sequences.py` trains policies with memory, and
+leaves out the sequences without a valid sample.
 """

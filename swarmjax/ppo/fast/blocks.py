@@ -17,8 +17,8 @@ from swarmjax.ppo.batch import Batch
 from swarmjax.ppo.gradients import Learning, Metrics, Progress
 from swarmjax.ppo.networks import Params
 
-# Samples of a block. With layers of 64, sizes from 100 to 6,000 were tried: 250 to 400 samples took
-# the least CPU time.
+# Samples of a block. With hidden layers of width 64, blocks of 100 to 6,000 samples were timed:
+# blocks of 250 to 400 samples took the least CPU time.
 BLOCK = 256
 
 
@@ -33,7 +33,7 @@ def learn(
       samples: [G, N, ...], zero where not valid.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics of each step, [epochs].
+      Parameters and the optimiser's state after all epochs, and the metrics of each, [epochs].
     """
 
     @jax.custom_batching.sequential_vmap
@@ -51,14 +51,14 @@ def learn(
 
 
 def arrange(samples: Batch) -> tuple[Batch, jax.Array]:
-    """Puts the valid samples first and cuts all of them into blocks.
+    """Puts the valid samples first and cuts all samples into blocks.
 
     Args:
       samples: [G, N, ...], zero where not valid.
 
     Returns:
-      The blocks [K, B, ...], B at most `BLOCK`; the padding of the last one is not valid. Also how
-      many blocks hold a valid sample, [], int32; they come first.
+      The blocks [K, B, ...], B at most `BLOCK`; the padding of the last block is not valid. Also
+      how many blocks hold a valid sample, [], int32; these blocks come first.
     """
     flat = valid_first(samples)
     size = min(BLOCK, len(flat.valid))
@@ -80,9 +80,9 @@ def gradient(
     Args:
       params: Parameters of the actor and the critic.
       blocks: The samples, [K, B, ...].
-      used: [], how many blocks to use.
+      used: [], how many blocks to use, from the first one on.
       learning: Networks, clip range and costs.
-      expected_valid: [], valid samples of the batch.
+      expected_valid: [], number of valid samples in the whole batch.
 
     Returns:
       The gradient, and the metrics of the loss; 0 if nothing is valid.
@@ -102,7 +102,7 @@ def add_up[T](count: jax.Array, part: Callable[[jax.Array | int], T]) -> T:
 
     Args:
       count: [], int32, how many parts there are.
-      part: Computes the part with a given number, as a tree of arrays.
+      part: Computes the part with a given index, from 0, as a tree of arrays.
 
     Returns:
       The sum; 0 if there are no parts.
@@ -129,7 +129,7 @@ def valid_first(samples: Batch) -> Batch:
     within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
     before = jnp.cumsum(within[:, -1]) - within[:, -1]
     index = jnp.arange(groups * each, dtype=jnp.int32)
-    beyond = groups * each + index  # out of range, so dropped; all differ, as unique_indices needs
+    beyond = groups * each + index  # dropped, as out of range; distinct for unique_indices
     place = jnp.where(samples.valid.ravel(), (before[:, None] + within - 1).ravel(), beyond)
     source = jnp.zeros_like(index).at[place].set(index, mode="drop", unique_indices=True)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[source], samples)

@@ -1,16 +1,16 @@
 """The gradient of the PPO loss of a minibatch on an NVIDIA GPU, with one kernel for each network.
 
-It is the gradient of `gradients.ppo_loss`, written out. With s over the valid samples, n =
-max(expected_valid, 1), ratio r_s = exp(log pi(a_s) - log pi_old(a_s)) and V the critic, that loss
-is
+It is the gradient of `gradients.ppo_loss`, written out. That loss is
 
     1/n sum_s [-min(r_s A_s, clip(r_s) A_s) + value_cost (V_s - R_s)^2 / 2 - entropy_cost H
                + BOUND_COST |b_s|^2].
 
-b_s is how far the mean action lies beyond -1..1.
+The sum runs over the valid samples s, and n = max(expected_valid, 1). a_s is the action, pi the
+policy, r_s = exp(log pi(a_s) - log pi_old(a_s)) the ratio, A_s the advantage, V_s the critic's
+value, R_s the return, and H the entropy. b_s is how far the mean action lies beyond -1..1.
 
-The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied
-afterwards. The kernels take tiles of samples in any order. So once the valid samples lie first, the
+The kernels sum over samples. Factors and terms that all samples share, such as 1/n, are applied to
+the sums. The kernels take tiles of samples in any order. So once the valid samples lie first, the
 kernels can read the batch in place. A minibatch is then a choice of tiles, and tiles without a
 valid sample are never read.
 """
@@ -36,16 +36,17 @@ from swarmjax.ppo.networks import Params
 
 # 64 samples are the fewest rows that four warps multiply at once on an H100. With two layers of 64,
 # each of the 128 threads then uses all of its 255 registers, and a program uses 80 kB of the chip's
-# memory. Each of the 132 multiprocessors holds two such programs, so all 264 run from start to end.
+# memory. Each of the 132 multiprocessors holds two such programs, so all 264 run at the same time.
 LAUNCH = Launch(tile=64, programs=264, warps=4)
-# 30 % faster on an H100 (1.53 instead of 2.19 ms), but a program needs more of the chip's memory.
+# 30 % faster than `LAUNCH` on an H100 (1.53 instead of 2.19 ms), but a program needs more of the
+# chip's memory.
 LARGE = Launch(tile=128, programs=264, warps=8)
 # Fewest tiles of a minibatch: with fewer, one tile more or less makes minibatches too unequal.
 _LEAST_TILES = 8
 
-# The metrics of a step with kernels: those of `gradients.ppo_loss` for a critic of the observation,
-# the norm of the gradient before clipping, and two flags. One flag is 1 if the step was taken, the
-# other if it was skipped.
+# The metrics of a step with kernels: those of `gradients.ppo_loss` if the critic sees only the
+# observation, the norm of the gradient before clipping, and two flags. One flag is 1 if the step was
+# taken, the other is 1 if the step was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
@@ -92,8 +93,8 @@ def choose_launch(
       samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
 
     Returns:
-      `LARGE` if the chip has enough memory for it, and each minibatch gets at least
-      `_LEAST_TILES` tiles.
+      `LARGE` if the chip has enough memory for it and each minibatch gets at least `_LEAST_TILES`
+      tiles; otherwise `LAUNCH`.
     """
     if samples is not None and samples < _LEAST_TILES * config.num_minibatches * LARGE.tile:
         return LAUNCH
@@ -144,7 +145,7 @@ def layouts(params: Params) -> dict[str, KernelLayout]:
 def shuffle(
     keys: jax.Array, samples: int, valid: jax.Array, minibatches: int, launch: Launch
 ) -> Tiles:
-    """Deals the tiles that hold valid samples out to minibatches; sizes differ by one at most.
+    """Deals the tiles that hold valid samples out to minibatches, as evenly as possible.
 
     If there are fewer such tiles than minibatches, some minibatches get none.
 
@@ -156,7 +157,8 @@ def shuffle(
       launch: Its `tile` is the number of samples of a tile.
 
     Returns:
-      The order of each pass, one after the other, and the span [E M, 2] of each minibatch.
+      The tiles: the orders of all passes, one after the other, and the span [E M, 2] of each
+      minibatch.
     """
     count = -(-samples // launch.tile)
     used = -(-valid // launch.tile)
@@ -229,8 +231,8 @@ def _with_entropy(
 ) -> jax.Array:
     """Adds the entropy cost's derivative with respect to `log_std`, which begins at index `first`.
 
-    The entropy is the sum of log_std and a constant, so the derivative is 1. The gradient never
-    moves a deviation that follows a schedule.
+    The entropy is the sum of log_std and a constant, so the derivative is 1. If exploration
+    is scheduled, the gradient with respect to `log_std` is set to 0.
     """
     index = jnp.arange(gradient.shape[0])
     moved = 0.0 if config.exploration == "scheduled" else gradient - config.entropy_cost * weight
@@ -255,11 +257,11 @@ def _layout(network: Params, last: str) -> KernelLayout:
 def _surrogate(
     config: AlgoConfig, size: int, output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
-    """Computes the clipped surrogate, negated, with the action padded by zeros.
+    """Computes the clipped surrogate, negated. Zeros pad the arrays of actions to a wider width.
 
     Schulman et al. 2017, "Proximal Policy Optimization Algorithms", equation 7. If the minimum is
     r A, its derivative with respect to log pi is r A, since dr / dlog pi = r. If the minimum is the
-    clipped term, the derivative is 0. Within the range the two terms are equal. With
+    other, clipped term, the derivative is 0. Within the range the two terms are equal. With
     z = (a - mu) / sigma, log pi is the sum over the action of
     -z^2 / 2 - log sigma - log(2 pi) / 2. Its derivatives with respect to mu and log sigma are
     z / sigma and z^2 - 1.
@@ -297,7 +299,7 @@ def _surrogate(
 def _half_square(
     output: jax.Array, samples: Samples, vectors: Samples
 ) -> tuple[jax.Array, Metrics]:
-    """Computes half the squared error of the output's first column; the others are padding."""
+    """Computes half the squared error of the output's first column; other columns are padding."""
     del vectors
     value = jnp.sum(output, axis=1)
     error = jnp.where(samples["valid"] > 0.0, value - samples["return_"], 0.0)
@@ -311,14 +313,14 @@ def _half_square(
 def learn(
     learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
-    """Learns from a batch, in minibatches of tiles of valid samples.
+    """Learns from a batch, in minibatches that consist of tiles of valid samples.
 
     Each device deals out its own tiles. The samples of a minibatch therefore depend on the number
     of devices as well as on the random streams.
 
     Here each network is one vector, and the optimiser's state for each network is also one vector.
-    With two dozen small arrays instead, most kernels of a minibatch would handle only one array
-    each.
+    Otherwise there would be two dozen small arrays, and most kernels of a minibatch would handle
+    only one of them.
 
     Args:
       learning: Settings and networks that `fits` accepts, and the optimiser.
@@ -327,7 +329,8 @@ def learn(
       key: Random key, consumed.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics of each step, [steps].
+      Parameters and the optimiser's state after the update, and the metrics of each step,
+      [steps].
     """
     params, state = begun
     config, shards = learning.config, learning.shards

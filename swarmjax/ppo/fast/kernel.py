@@ -1,11 +1,12 @@
-"""A kernel that takes samples forward through a network and a loss, and back, on the chip.
+"""A kernel that takes samples through a network and a loss, and gradients back, on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
-keeps the activations of a tile of samples on the chip. It writes only its sums, once it ends.
+keeps the activations of a tile of samples on the chip. The program writes only its sums, at its end.
 Programs share nothing, so the same samples give the same bits. A network is one vector, and so is
 its gradient: the optimiser then handles one array instead of a dozen.
 
-B stands for samples, P for programs, and `tile` for the samples that a program holds at once.
+B is the number of samples, P the number of programs, and `tile` the number of samples that a
+program holds at once.
 """
 
 import functools
@@ -28,7 +29,7 @@ MOST_WIDTH = 128
 # counts what the matrix products of capability 9.0 take; those of other capabilities take up to 4
 # KiB more.
 SHARED_MEMORY = 95 * 1024
-# Bytes by compute capability, where a program may use more; from the same source.
+# The same for chips where a program may use more, by compute capability; from the same source.
 _MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 
@@ -50,7 +51,7 @@ class Place(NamedTuple):
     Attributes:
       kernel: Index of the kernel's first number.
       bias: Index of the bias's first number.
-      shape: Numbers of inputs and outputs.
+      shape: Number of inputs, and number of outputs.
     """
 
     kernel: int
@@ -63,8 +64,8 @@ class Launch(NamedTuple):
 
     Attributes:
       tile: Samples of a tile, a power of two of at least `LEAST_WIDTH`.
-      programs: Programs of the grid, at most. There are never more programs than tiles.
-      warps: Warps of a program.
+      programs: Greatest number of programs in the grid. There are never more programs than tiles.
+      warps: Number of warps of a program.
     """
 
     tile: int
@@ -87,10 +88,10 @@ class KernelLayout(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """The tiles of samples that a kernel takes. Tile i is samples i * tile to (i + 1) * tile.
+    """The tiles of samples that a kernel takes. Tile i begins with sample i * tile.
 
     Attributes:
-      order: [K], int32, numbers of tiles.
+      order: [K], int32, indices of tiles.
       span: [2], int32, two indices of `order`: the first to take, and the first to leave out.
     """
 
@@ -115,7 +116,7 @@ def shared_memory() -> int:
 
 
 def padded_width(width: int) -> int:
-    """Returns the next power of two: Triton supports no other widths."""
+    """Returns the width with padding: a power of two, for Triton, and at least `LEAST_WIDTH`."""
     return max(LEAST_WIDTH, pl.next_power_of_2(width))
 
 
@@ -129,14 +130,15 @@ def fits(
     """Tells whether the kernel supports a network: its widths, and the memory that it needs.
 
     Triton stores the first weight matrix once and all others twice: the second copy is transposed
-    for the backward pass. It also stores a tile of observations and two of the widest hidden layer.
+    for the backward pass. It also stores a tile of observations, and two tiles of the widest hidden
+    layer.
 
     Args:
       inputs: Width of the observation. The widths of observation and output are padded.
       hidden: Widths of the hidden layers, powers of two.
       outputs: Width of the output.
       tile: Samples of a tile.
-      memory: Bytes on the chip for a program.
+      memory: Bytes of the chip's memory that a program may use.
 
     Returns:
       Whether `sums` may be called.
@@ -161,16 +163,16 @@ def sums(
     """Sums the gradient of a loss, and the loss's other terms, over the samples of some tiles.
 
     Args:
-      parameters: [n] of a network. They are read and written without padding, and padded on the
-        chip.
+      parameters: [n] of a network. They have no padding in the GPU's memory, and are padded on
+        the chip.
       layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
         unchanged.
       activation: Activation of the hidden layers, `tanh`, `relu` or `swish`.
-      loss: Loss of the output. Its results must be 0 for samples that do not count. It gets the
+      loss: Loss of the output. Its results must be 0 for samples that are not valid. It gets the
         layout's vectors with padding, and returns their derivatives under the same names.
       samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
         input.
-      tiles: The tiles to take, each of `launch.tile` samples.
+      tiles: The tiles to sum over, each of `launch.tile` samples.
       launch: How the kernel is spread over the GPU.
 
     Returns:
@@ -213,7 +215,7 @@ def _program(
     tiles: Any,
     totals: Any,
 ) -> None:
-    """Runs one program, on every P-th tile; all arguments after `tile` are references."""
+    """Runs one of P programs, on every P-th tile; all arguments after `tile` are references."""
     program, programs = pl.program_id(0), pl.num_programs(0)
     layers = tuple(_read_layer(parameters, place) for place in layout.layers)
     vectors = {name: _read_row(parameters, *at) for name, at in layout.vectors.items()}
@@ -240,7 +242,7 @@ def _program(
 
 
 def _at(first: Any, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Returns indices of a padded array stored row by row in a vector, and which of them exist."""
+    """Returns where the numbers of a padded array lie in a vector, and which are no padding."""
     counts = [jnp.arange(padded_width(width)) for width in shape]
     if len(shape) == 1:
         return first + counts[0], counts[0] < shape[0]
@@ -288,7 +290,7 @@ def _of_tile(
     samples: Samples,
     vectors: dict[str, jax.Array],
 ) -> tuple[tuple[Layer, ...], dict[str, jax.Array]]:
-    """Runs a tile forward and backward; returns sums of the gradient and of the other terms."""
+    """Runs a tile forward and backward; returns the summed gradient and each sample's terms."""
     activations, output = _forward(activation, network, samples["observation"])
     slope, parts = loss(output, samples, vectors)
     return _backward(activation, network, activations, slope), parts
@@ -297,7 +299,7 @@ def _of_tile(
 def _forward(
     activation: str, network: tuple[Layer, ...], features: jax.Array
 ) -> tuple[_Activations, jax.Array]:
-    """Returns each layer's input, with the value before its activation, and the output."""
+    """Returns each layer's input, before and after its activation, and the network's output."""
     seen, before = [], features
     for layer in network[:-1]:
         seen.append((before, features))
@@ -314,7 +316,7 @@ def _backward(
 
     With z = x W + b and g the derivative with respect to z, the derivatives with respect to W, b
     and x are x^T g, the sum of g over samples, and g W^T. If x = f(z') is the output of the layer
-    before, its derivative is multiplied by f'(z').
+    before, the derivative with respect to z' is that of x times f'(z').
     """
     gradient = []
     for index in reversed(range(len(network))):
@@ -327,7 +329,7 @@ def _backward(
 
 
 def _outer(features: jax.Array, slope: jax.Array) -> jax.Array:
-    """Computes x^T g with the wider one in front: an H100's fast products need 64 rows or more."""
+    """Computes x^T g, the wider factor first: an H100's fast products need 64 rows or more."""
     if features.shape[1] < slope.shape[1]:
         return jnp.dot(slope.T, features).T
     return jnp.dot(features.T, slope)

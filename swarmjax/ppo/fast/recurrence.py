@@ -4,8 +4,8 @@ XLA launches several kernels for each step of a sequence, and passes data betwee
 GPU's memory. Here a program of the grid holds a tile of sequences and their memory, and runs all
 steps.
 
-T stands for control steps, B for sequences, F for features, H for the memory's width, and `tile`
-for the sequences that a program holds.
+T is the number of control steps, B of sequences, F of features, H the memory's width, and `tile`
+the number of sequences that a program holds.
 """
 
 import functools
@@ -20,21 +20,21 @@ from jax.experimental.pallas import triton
 from swarmjax.ppo.fast import kernel as hardware
 from swarmjax.ppo.fast.kernel import logistic
 
-# Sequences of a tile. Up to `MOST_SMALL` sequences of a learner, the smaller tile gives more of the
-# chip's processors a program, and is faster on an H100. With more sequences, the backward pass is
-# faster with the larger tile. Several seeds side by side fill the chip earlier; that was not timed.
-# In the backward pass, 8 warps took twice as long with 64 sequences. With 32 sequences, 4 warps
-# were slower than 8 (docs/performance.md).
+# Sequences of a tile. If a learner has at most `MOST_SMALL` sequences, the smaller tile gives more
+# of the chip's processors a program, and is faster on an H100. With more sequences, the backward
+# pass is faster with the larger tile. Several seeds side by side fill the chip with fewer sequences
+# of each; that was not timed. In the backward pass, 8 warps took twice as long with tiles of 64
+# sequences. With tiles of 32 sequences, 4 warps were slower than 8 (docs/performance.md).
 SMALL_TILE, TILE = 16, 32
 MOST_SMALL = 8192
 _WARPS, _BACKWARD_WARPS = 4, 8
 # Steps that the backward pass has in flight: it loads the inputs of the next steps while it
-# computes one. On an H100 this takes 0.56 to 0.64 of the time without. The forward pass became
-# slower.
+# computes one. On an H100, the backward pass then takes 0.56 to 0.64 of its time without this. The
+# forward pass became slower, so it has one step in flight.
 _STAGES = 3
-# The GRU's inputs and their gradient are the largest arrays. With half as many bytes, training took
-# 8 % less time on an H100. The rollout rounds in the same way, so that ratios of probabilities
-# begin at 1.
+# Type of the GRU's inputs and of their gradient, which are the largest arrays. With half as many
+# bytes as float32, training took 8 % less time on an H100. The rollout rounds in the same way, so
+# that ratios of probabilities begin at 1.
 _SEEN = jnp.bfloat16
 # Supported widths of a memory. An operand of a tensor core is at least 16 wide, and weight matrices
 # wider than 64 do not fit on the chip.
@@ -56,12 +56,14 @@ class _Rows(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """The weights of a unit, or three of each: of reset, update and candidate.
+    """The weights of a GRU.
+
+    Each field is one array for all gates, or three arrays: for reset, update and candidate.
 
     Attributes:
-      kernel: [H, 3 H], or [H, H] each, weights of the memory.
-      bias: [3 H], or [H] each, added to the memory's part.
-      bias_seen: [3 H], or [H] each, added to the input's part.
+      kernel: [H, 3 H], or three of [H, H], weights of the memory.
+      bias: [3 H], or three of [H], added to the memory's part.
+      bias_seen: [3 H], or three of [H], added to the input's part.
     """
 
     kernel: Any
@@ -70,7 +72,7 @@ class _Weights(NamedTuple):
 
 
 class _Sequences(NamedTuple):
-    """The inputs of a unit [T B, 3 H], where episodes begin [T B] (0 or 1), and memories [B, H]."""
+    """A GRU's inputs [T B, 3 H], where episodes begin [T B] (0 or 1), and memories [B, H]."""
 
     seen: Any
     begins: Any
@@ -78,7 +80,7 @@ class _Sequences(NamedTuple):
 
 
 class _Gates(NamedTuple):
-    """What a step computes, [tile, H] each.
+    """What a step computes; each field is [tile, H].
 
     Attributes:
       reset: 0..1.
@@ -101,7 +103,7 @@ def fits(size: int, shared_memory: int) -> bool:
 
     Args:
       size: H.
-      shared_memory: Bytes on the chip for a program.
+      shared_memory: Bytes of the chip's memory that a program may use.
 
     Returns:
       Whether `remember_all` may be called.
@@ -110,27 +112,27 @@ def fits(size: int, shared_memory: int) -> bool:
 
 
 def _bytes(size: int) -> int:
-    """Returns the bytes on the chip for a program that has one step in flight."""
+    """Returns the bytes on the chip that a program with one step in flight needs."""
     return 4 * (2 * size * 3 * size + 4 * TILE * size)
 
 
 def _tile(sequences: int) -> int:
-    """Chooses the sequences of a tile for a number of sequences."""
+    """Chooses how many sequences a tile has, for the sequences of a learner."""
     return SMALL_TILE if sequences <= MOST_SMALL else TILE
 
 
 def _stages(size: int, shared_memory: int) -> int:
     """Chooses how many steps of the backward pass are in flight.
 
-    Each further step holds a tile of its inputs on the chip: three gates in bfloat16, and the
-    memory before, the first memory and the derivative in float32.
+    Each further step holds a tile of its inputs on the chip: the inputs of three gates in
+    bfloat16, and the memory before, the first memory and the derivative in float32.
 
     Args:
       size: H.
-      shared_memory: Bytes on the chip for a program.
+      shared_memory: Bytes of the chip's memory that a program may use.
 
     Returns:
-      1 if the inputs of further steps do not fit beside what `fits` counts.
+      `_STAGES`, or 1 if the inputs of further steps do not fit beside what `fits` counts.
     """
     inputs = TILE * size * (3 * 2 + 3 * 4)
     return _STAGES if _bytes(size) + (_STAGES - 1) * inputs <= shared_memory else 1
@@ -148,11 +150,11 @@ def remember_all(
     JAX's precision, `jax.default_matmul_precision`.
 
     Args:
-      layers: `input` and `recurrent` of the unit, each with `kernel` [F or H, 3 H] and `bias`
+      layers: `input` and `recurrent` of the GRU, each with `kernel` [F or H, 3 H] and `bias`
         [3 H]; `fits` accepts H.
       features: [T, B, F].
       begins: [T, B], whether an episode begins with the step.
-      memory: [B, H] before the first step.
+      memory: [B, H], memory before the first step.
 
     Returns:
       The memory [T, B, H] after each step.
@@ -175,7 +177,7 @@ def remember(
     Args:
       layers: As `remember_all` takes them.
       features: [B, F].
-      memory: [B, H] before the observation.
+      memory: [B, H], memory before the observation.
 
     Returns:
       The memory [B, H] after the observation.
@@ -188,7 +190,7 @@ def remember(
 
 @jax.custom_vjp
 def _through(weights: _Weights, sequences: _Sequences) -> jax.Array:
-    """Runs the unit through sequences; returns the memory after each step, [T, B, H]."""
+    """Runs the GRU through sequences; returns the memory after each step, [T, B, H]."""
     count, size = sequences.memory.shape
     steps, tile = len(sequences.seen) // count, _tile(count)
     every = pl.pallas_call(
@@ -243,7 +245,7 @@ _through.defvjp(_through_forward, _through_backward)
 
 
 def _forward(steps: int, tile: int, weights: _Weights, sequences: _Sequences, every: Any) -> None:
-    """Runs one program: a tile of sequences from first step to last; arguments are references."""
+    """Runs a program: a tile of sequences, first step to last; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
     own = _own(count, tile)
 
@@ -267,7 +269,7 @@ def _backward(
     slope: Any,
     found: dict[str, Any],
 ) -> None:
-    """Runs one program: a tile of sequences from last step to first; arguments are references."""
+    """Runs a program: a tile of sequences, last step to first; arguments are references."""
     unit, (count, size) = _read_unit(weights), sequences.memory.shape
     own = _own(count, tile)
 
@@ -308,7 +310,7 @@ def _write_sums(
 
 
 def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Weights) -> _Gates:
-    """Computes the gates as `memory.remember` does, before it mixes them."""
+    """Computes the gates and the candidate as `memory.remember` does."""
     size = before.shape[1]
 
     def of(gate: int) -> tuple[jax.Array, jax.Array]:
@@ -323,13 +325,14 @@ def _gates(seen: Any, rows: _Rows, before: jax.Array, unit: _Weights) -> _Gates:
 def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three, _Three, jax.Array]:
     """Backpropagates from the memory after a step through the gates.
 
-    r and u are the gates, n = tanh(x + r c) is the candidate, and h' = n + u (h - n). The
+    r and u are the gates. n = tanh(x + r c) is the candidate, with the input's part x and the
+    memory's part c. h is the memory before the step, and h' = n + u (h - n) after it. The
     derivatives of h' with respect to n, u and h are 1 - u, h - n and u. The derivatives of tanh and
     of the logistic function are 1 - n^2 and r (1 - r).
 
     Returns:
-      Derivatives with respect to the inputs and to the memory's part, gate by gate, and to the
-      memory before.
+      Derivatives with respect to the inputs, gate by gate; with respect to the memory's parts, gate
+      by gate; and with respect to h where h' uses it directly.
     """
     reset, update, candidate, recalled = gates
     by_candidate = slope * (1.0 - update) * (1.0 - candidate * candidate)
@@ -340,18 +343,18 @@ def _slopes(slope: jax.Array, gates: _Gates, before: jax.Array) -> tuple[_Three,
 
 
 def _own(count: int, tile: int) -> _Rows:
-    """Returns this program's sequences at the first step; to be called outside of a loop."""
+    """Returns this program's sequences at the first step. Call it outside of a loop."""
     at = pl.program_id(0) * tile + jnp.arange(tile)
     return _Rows(at, at < count)
 
 
 def _rows(own: _Rows, first: jax.Array) -> _Rows:
-    """Moves the same sequences to the step whose first row is `first`."""
+    """Returns the same sequences at the step whose first row is `first`."""
     return own._replace(at=first + own.at)
 
 
 def _goes_on(begins: Any, rows: _Rows) -> jax.Array:
-    """Returns whether an episode goes on, [tile, 1], 0 or 1."""
+    """Returns 0 where an episode begins with the step, and otherwise 1, [tile, 1]."""
     return 1.0 - triton.load(begins.at[rows.at], mask=rows.exist, other=0.0)[:, None]
 
 

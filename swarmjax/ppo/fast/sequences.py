@@ -1,9 +1,9 @@
 """Updates of policies with memory, in minibatches of sequences that hold a valid sample.
 
 A sequence is the rollout of one robot. A robot that is absent, or had arrived before the rollout
-began, has no valid sample. The sequences of such robots come last, and tiles that hold no other
-sequences are left out. The other sequences are shuffled one by one, and a minibatch is processed in
-tiles of a fixed number of sequences. The loss is a sum over samples, so the gradients of tiles add
+began, has no valid sample. The other sequences are shuffled one by one. A minibatch is processed in
+tiles of a fixed number of sequences. Sequences without a valid sample come last, and tiles that
+hold no other sequences are left out. The loss is a sum over samples, so the gradients of tiles add
 up.
 """
 
@@ -20,33 +20,34 @@ from swarmjax.ppo.memory import NO_MEMORY
 from swarmjax.ppo.networks import Params
 from swarmjax.shards import ALONE, Shards
 
-# Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches where all robots
-# are present, and are well filled where few are.
+# Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches if all robots are
+# present, and are still well filled if few robots are present.
 CPU_TILE = 32
-# Fewest and most samples of a tile on an accelerator, for all learners side by side. An accelerator
-# runs one step after the other, so a large tile takes little longer than a small one. With default
-# layers, the largest tile takes about 12 GB.
+# Fewest and most samples of a tile on an accelerator, summed over all learners side by side. An
+# accelerator runs the control steps one after the other, so a large tile takes little longer than a
+# small one. With default layers, the largest tile takes about 12 GB.
 TILE_SAMPLES = 2**17, 2**21
-# The memory kernels compute at least so many sequences at once.
+# Fewest sequences that the memory kernels compute at once.
 FEWEST_SEQUENCES = 16
-# Between these bounds, an accelerator splits a full minibatch into this many tiles. Where most
-# robots are absent, most of the tiles are left out.
+# An accelerator splits a full minibatch into this many tiles, unless the bounds above demand
+# another size. If most robots are absent, most of the tiles are left out.
 _TILES = 4
 
 
 def learn(
     learning: Learning, begun: Progress, samples: Batch, key: jax.Array
 ) -> tuple[Progress, Metrics]:
-    """Learns from a batch, in minibatches of useful sequences.
+    """Learns from a batch, in minibatches of sequences that hold a valid sample.
 
     Args:
       learning: Settings, networks with memory, and the optimiser.
       begun: Parameters and the optimiser's state.
-      samples: [G, N, ...], zero where not valid, ordered by step.
+      samples: [G, N, ...], zero where not valid; the samples of a group are ordered by step.
       key: Random key, consumed.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics of each step, [epochs, M].
+      Parameters and the optimiser's state after the update, and the metrics of each step,
+      [epochs, M] for M minibatches.
     """
     config, shards = learning.config, learning.shards
     rows = arrange(samples, config.rollout_length)
@@ -69,8 +70,8 @@ def arrange(samples: Batch, steps: int) -> Batch:
     """Lays samples out by sequence.
 
     Args:
-      samples: [G, T S, ...], and memory [G, S, H].
-      steps: T.
+      samples: [G, T S, ...], and memory [G, S, H], for S robots per group.
+      steps: T, control steps of a sequence.
 
     Returns:
       [Q, T, ...] and memory [Q, H], with Q = G S. The robots of the first group come first.
@@ -87,21 +88,22 @@ def arrange(samples: Batch, steps: int) -> Batch:
 def deal(
     key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE
 ) -> tuple[jax.Array, jax.Array]:
-    """Deals the useful sequences out to minibatches at random.
+    """Deals the sequences with a valid sample out to minibatches at random.
 
     Each stream of random numbers deals its own sequences out, as evenly as possible, so that a
     minibatch holds the same sequences on any number of devices. If a stream has fewer sequences
-    than there are minibatches, the last minibatches get none of them.
+    than there are minibatches, the last minibatches get no sequence of this stream.
 
     Args:
       key: Random key, the same on all devices, consumed.
       useful: [Q], bool, which sequences of this device hold a valid sample.
-      minibatches: M.
+      minibatches: M, number of minibatches.
       shards: How the sequences are spread over devices.
 
     Returns:
       The order [Q] of all sequences of this device, int32, and the span [M, 2] of each minibatch
-      in it. The sequences of the first minibatch come first, and useless ones last.
+      in this order: its begin and its end. The sequences of the first minibatch come first, and
+      those without a valid sample come last.
     """
     by_stream = useful.reshape(shards.local_streams, -1)
     size = by_stream.shape[1]
@@ -158,14 +160,14 @@ def tile_size(sequences: int, minibatches: int, steps: int, learners: int) -> in
     """Chooses how many sequences a tile has, so that few tiles fill the fullest minibatch.
 
     Args:
-      sequences: Q of the batch.
-      minibatches: M.
-      steps: T of a sequence.
-      learners: How many learners a device trains at once, each with such a batch.
+      sequences: Q, sequences of the batch.
+      minibatches: M, number of minibatches.
+      steps: T, control steps of a sequence.
+      learners: How many learners a device trains at once, each with a batch of this size.
 
     Returns:
-      At least 1. On an accelerator it respects `TILE_SAMPLES`, unless that is less than
-      `FEWEST_SEQUENCES`.
+      At least 1. On an accelerator, a tile has at most as many samples as `TILE_SAMPLES` allows,
+      or `FEWEST_SEQUENCES` sequences if these have more samples.
     """
     fullest = -(-sequences // minibatches)
     if jax.default_backend() == "cpu":
@@ -178,7 +180,7 @@ def tile_size(sequences: int, minibatches: int, steps: int, learners: int) -> in
 
 
 def take_tile(rows: Batch, order: jax.Array, start: jax.Array, end: jax.Array, size: int) -> Batch:
-    """Takes the sequences of a tile, step by step.
+    """Gathers the samples of a tile, ordered by step.
 
     Args:
       rows: Result of `arrange`.
@@ -186,7 +188,7 @@ def take_tile(rows: Batch, order: jax.Array, start: jax.Array, end: jax.Array, s
       start: [], int32, index in `order` of the tile's first sequence.
       end: [], int32, index in `order` at which the minibatch ends. Samples of sequences from this
         index on are not valid.
-      size: Sequences of the tile.
+      size: Number of sequences in the tile.
 
     Returns:
       [T size, ...], ordered by step, and memory [size, H].
