@@ -1,10 +1,9 @@
-"""Loads and checks settings of any kind: a strict converter, and a composer for configs/.
+"""Loads and checks settings: merges files of configs/ with a command line, and converts the result.
 
-`section.py` turns plain data into frozen dataclasses, and refuses each mistake in one sentence.
-`values.py` converts and formats single values. `files.py` composes the files of configs/ with the
-words of a command line. Each section of settings lies in `config.py` of the package that the
-section configures. This package imports no other package of the project. Start with
-`section.build`.
+`section.py` turns plain data into frozen dataclasses, and refuses each mistake with one sentence.
+`values.py` converts and formats single values. `files.py` merges the files of configs/ with the
+`key=value` words of a command line. The settings of a package are defined in that package's file
+`config.py`. This package imports no other package of the project. Read `section.build` first.
 """
 
 from swarmjax.config.section import Section, about, build, setting, to_dict

@@ -1,7 +1,7 @@
 """Composes the files of configs/ and the words of a command line into plain data.
 
-Files and values of words are YAML 1.2. Nothing in them is evaluated: `${...}` is text like any
-other. `section.build` takes the result.
+The words are `key=value`. The files, and the values in the words, are YAML 1.2. Nothing in them is
+evaluated: `${...}` is plain text. `section.build` turns the composed data into settings.
 """
 
 import difflib
@@ -18,12 +18,13 @@ from swarmjax.config.values import ConfigError, check_text, show
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MOST_KEY = 200  # letters of a key on the command line
 
-# Groups whose message about an unknown choice says that a path is allowed.
+# For these groups, the message about an unknown choice says that the path of a file is allowed too.
 _OWN_FILES = ("stage", "robot", "realism", "recipes")
-# The group whose files set keys of all sections, as `algo=paper` does, and not only its own.
+# The files of this group may set keys of every section, as `algo=paper` does, not only its own.
 _WHOLE = "algo"
 
-# Takes the composed data and the choice of each group, and returns the keys and values to check.
+# A function that takes the composed data and the choice of each group, and returns the keys and
+# values to check.
 Complete = Callable[[dict[str, Any], dict[str, str]], dict[str, Any]]
 
 
@@ -32,9 +33,9 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
 
     Args:
       cls: the command's dataclass. Its `command` names the file in configs/.
-      overrides: the words.
+      overrides: the `key=value` words.
       complete: a function that takes the composed data and the choice of each group, and returns
-        the keys and values to check. None checks the composed data itself.
+        the keys and values to check. With None, the composed data are checked as they are.
 
     Returns:
       The settings.
@@ -52,7 +53,12 @@ def load[C: Section](cls: type[C], overrides: Sequence[str], complete: Complete 
 
 
 def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Reads a file of the group that may set keys of all sections: its section, and the others."""
+    """Reads a file of the group `algo`, which may set keys of every section.
+
+    Returns:
+      The values of the section `algo`, nested below that name; and the values of all other keys, by
+      dotted key.
+    """
     if choice is None:
         return {}, {}
     found = read_choice(_WHOLE, choice)
@@ -63,16 +69,16 @@ def _read_whole(cls: type[Section], choice: str | None) -> tuple[dict[str, Any],
 
 
 def shared_words(cls: type[Section], found: Mapping[str, Any], path: Path) -> list[str]:
-    """Returns the settings of a file for a whole run as words.
+    """Returns the keys and values of a file for a whole run as `key=value` words.
 
     Args:
-      cls: the command's dataclass. Its `shared` lists the keys and sections that such a file, which
-        may come from somebody else, may set.
+      cls: the command's dataclass. Its `shared` lists the keys and sections that such a file may
+        set. The list is short, because the file may come from somebody else.
       found: the keys and values of the file.
-      path: the file. Relative paths in it are meant from its folder.
+      path: the file. Relative paths in the file start from the folder of the file.
 
     Raises:
-      ConfigError: if there is another key.
+      ConfigError: if the file sets any other key.
     """
     for key in found:
         root = key.partition(".")[0]
@@ -92,12 +98,12 @@ def shared_words(cls: type[Section], found: Mapping[str, Any], path: Path) -> li
 
 
 def is_path(choice: str) -> bool:
-    """Returns whether the choice of a group is a user's file, and not a name in configs/."""
+    """Returns whether a choice is the path of a user's file, rather than a name in configs/."""
     return choice.endswith((".yaml", ".yml"))
 
 
 def beside(folder: Path, choice: str) -> str:
-    """Returns a choice made in a user's file; a relative path is meant from that file's folder.
+    """Returns a choice made in a user's file, with a relative path joined to that file's folder.
 
     Args:
       folder: the folder of the file that makes the choice.
@@ -111,7 +117,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
       base: the data.
-      over: the keys to replace, nested in the same way.
+      over: the keys to replace and their new values, nested in the same way.
     """
     found = dict(base)
     for key, value in over.items():
@@ -126,12 +132,15 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def choices(group: str) -> list[str]:
-    """Returns the names of a group's files; empty if it is not a group."""
+    """Returns the names of a group's files without `.yaml`; empty if there is no such group."""
     return sorted(path.stem for path in (_config_dir() / group).glob("*.yaml"))
 
 
 def defaults(command: str) -> dict[str, str]:
-    """Returns the groups of a command and the choices in its file; none if it has no file."""
+    """Returns a command's groups and their default choices, which its file in configs/ lists.
+
+    A command without a file has no groups.
+    """
     path = _config_dir() / f"{command}.yaml"
     return reading.read_yaml(path) if path.exists() else {}
 
@@ -159,7 +168,7 @@ def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, An
     Args:
       group: a folder of configs/.
       choice: the name of a file in that folder, or the path of another file.
-      key: name of the setting in messages; None: that of the group.
+      key: name of the setting in messages; None stands for the name of the group.
 
     Raises:
       ConfigError: if there is no such file, or it cannot be read.
@@ -168,7 +177,7 @@ def read_choice(group: str, choice: str, key: str | None = None) -> dict[str, An
 
 
 def named_path(folder: str, choice: str, key: str) -> Path:
-    """Returns the file that a choice names: one of a folder of configs/, or a user's own.
+    """Returns the path of the file that a choice names, in a folder of configs/ or elsewhere.
 
     Args:
       folder: a folder of configs/.
@@ -206,7 +215,7 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
       overrides: `key=value` words.
 
     Returns:
-      Plain data. The value of a group is the choice of its file.
+      Plain data by key. The value of a group is its choice, which names a file.
 
     Raises:
       ConfigError: if a word is not `key=value`, if its key is not in `cls`, if its key can only be
@@ -242,10 +251,10 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the values of dotted keys as nested plain data.
 
     Args:
-      flat: values by dotted key. Later ones override earlier ones.
+      flat: values by dotted key.
 
     Raises:
-      ConfigError: if a key continues below another key's value.
+      ConfigError: if a key such as `a.b` is there, but the value of `a` has no keys.
     """
     found: dict[str, Any] = {}
     for key, value in flat.items():
@@ -266,8 +275,8 @@ def flatten(nested: Mapping[str, Any], where: str = "") -> dict[str, Any]:
     """Returns nested settings as values by dotted key; the reverse of `nest`.
 
     Args:
-      nested: plain data; a section counts as its plain data.
-      where: the prefix of the keys.
+      nested: plain data, possibly with sections, which are converted to plain data first.
+      where: the prefix of the returned keys.
     """
     flat: dict[str, Any] = {}
     for key, value in nested.items():

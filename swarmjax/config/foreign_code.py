@@ -1,4 +1,4 @@
-"""Turns what the code of a user raises into one sentence."""
+"""Turns an exception from a user's code into a refusal of one sentence."""
 
 import contextlib
 from collections.abc import Iterator
@@ -8,10 +8,10 @@ from swarmjax.config.values import ConfigError
 
 @contextlib.contextmanager
 def explained(what: str) -> Iterator[None]:
-    """Turns whatever a user's code raises into one sentence, also `sys.exit()`.
+    """Turns any exception from a user's code into one sentence, even that of `sys.exit()`.
 
     Args:
-      what: the beginning of the sentence.
+      what: the beginning of the sentence, such as "FILE does not import".
 
     Raises:
       ConfigError: if the code in the block raises anything but a `KeyboardInterrupt`.

@@ -1,6 +1,7 @@
-"""Turns the settings of a run or policy into words that a command puts before the typed ones.
+"""Turns the settings of a run or policy into `key=value` words, for a command that continues it.
 
-The last word for a key counts, so typed words win.
+The command puts these words before the words that the user typed. The last word for a key counts,
+so typed words win.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,13 +14,13 @@ from swarmjax.config.section import Section
 def group_words(
     cls: type[Section], group: str, held: Section, typed: Sequence[str], skip: Iterable[str] = ()
 ) -> list[str]:
-    """Writes a section's values as words, except values that a typed choice of a file sets.
+    """Writes a section's values as words, but not those set by a file that the user has chosen.
 
     Args:
       cls: the command's dataclass.
       group: name of the section in that dataclass, such as `robot`.
       held: the section with the values of the run or policy.
-      typed: the words of the command line.
+      typed: the words that the user typed. One of them may choose a file for the section.
       skip: keys of the section to leave out.
 
     Returns:
@@ -37,17 +38,17 @@ def group_words(
 
 
 def preset_words(cls: type[Section], group: str, held: Any, typed: Sequence[str]) -> list[str]:
-    """Writes a section as its preset and the values that differ from it.
+    """Writes a section as words: its preset, and the values that differ from the preset.
 
     Args:
       cls: the command's dataclass.
       group: name of the section in that dataclass, such as `realism`.
       held: the section with the values of the run or policy. Its `name` is the name of its preset.
-      typed: the words of the command line.
+      typed: the words that the user typed.
 
     Returns:
-      The choice of the preset, and a word for each value that differs from the preset. Nothing if
-      another preset is typed.
+      A word that chooses the preset, and a word for each value that differs from the preset. No
+      words if the user has typed a preset.
     """
     if group in files.parse(cls, typed):
         return []
@@ -66,6 +67,6 @@ def preset_of(group: str, held: Section) -> str:
 
 
 def _differences(held: Section, other: Section) -> dict[str, Any]:
-    """Returns the values by dotted key that differ from another section."""
+    """Returns, by dotted key, the values that differ from those of another section."""
     mine, its = (files.flatten(section.to_dict(each)) for each in (held, other))
     return {key: value for key, value in mine.items() if key not in its or value != its[key]}

@@ -1,7 +1,8 @@
-"""Reads untrusted files from users, with YAML or JSON in them.
+"""Reads YAML and JSON files that users give, and does not trust them.
 
-Only regular files are read, because reading a pipe could block forever, and only up to a maximum
-size. YAML is measured before it is loaded.
+Only regular files are read, because reading a pipe could block forever. Whole files have a maximum
+size, and so has each line of a longer file. YAML is loaded only after its values and its depth have
+been counted.
 """
 
 import contextlib
@@ -17,9 +18,9 @@ from swarmjax.config.values import ConfigError, show
 MOST_TYPED = 2**20  # bytes in a file that a person writes; files of configs/ are 1000 times smaller
 MOST_MADE = 2**24  # bytes in a file that the project writes, such as a run's config
 _MOST_LINE = 2**24  # bytes in one line of a file with one object per line
-# Values in a YAML file. The largest file of configs/ has under 200.
+# The most values that a YAML file may have. The largest file of configs/ has under 200.
 MOST_VALUES = 10_000
-_MOST_DEPTH = 32  # nested lists and mappings
+_MOST_DEPTH = 32  # how deep lists and mappings may be nested
 _TOO_DEEP = f"lists or mappings are nested more than {_MOST_DEPTH} deep."
 
 
@@ -111,13 +112,13 @@ def parse_json(text: str, where: str) -> Any:
         found = json.loads(text)
     except (RecursionError, ValueError) as error:
         raise ConfigError(f"{where} cannot be read as JSON: {_first_line(error)}.") from None
-    if _depth(found) > _MOST_DEPTH:  # it would break writing or comparing the value later
+    if _depth(found) > _MOST_DEPTH:  # Python could not write or compare such a value later
         raise ConfigError(f"{where} cannot be read: {_TOO_DEEP}")
     return found
 
 
 def _depth(value: object, above: int = 0) -> int:
-    """Returns how deep lists and objects are nested; counts little further than allowed."""
+    """Returns how deep lists and objects are nested. It stops counting just beyond the maximum."""
     inner = list(value.values()) if isinstance(value, dict) else value
     if not isinstance(inner, list) or above > _MOST_DEPTH:
         return above
@@ -145,13 +146,13 @@ def read_lines(path: Path) -> Iterator[bytes]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Reads a YAML file of keys and values; an empty file has none.
+    """Reads a YAML file of keys and values. An empty file gives an empty dictionary.
 
     Args:
       path: the file.
 
     Raises:
-      ConfigError: as in `read_text` and `parse_yaml`, or if the file holds anything else.
+      ConfigError: as in `read_text` and `parse_yaml`, or if the file does not hold keys and values.
     """
     content = parse_yaml(read_text(path), f"{called(path)} cannot be read: ")
     if not isinstance(content, dict | None):
@@ -164,10 +165,10 @@ def parse_yaml(text: str, where: str) -> Any:
 
     Args:
       text: the whole text.
-      where: the beginning of messages about it.
+      where: the beginning of messages about the text.
 
     Returns:
-      Its content as plain data. `1e6` is a number; a date and `yes` are text.
+      The content as plain data. `1e6` is a number; a date and `yes` are text.
 
     Raises:
       ConfigError: if the text is not YAML, has a tag, expands to too many values, or has a key that

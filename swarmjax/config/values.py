@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 _MOST_NAME = 255  # bytes in a file name, on Linux, macOS and Windows
-_MOST_BITS = 13_000  # bits of a number to print; Python refuses to print more than 4300 digits
-_SHOWN = 80  # letters of a value to show in a message
-# What messages call the types, and examples of lists by the type of their items.
+_MOST_BITS = 13_000  # messages print shorter numbers; Python refuses to print over 4300 digits
+_SHOWN = 80  # characters of a value that a message shows
+# The name of each type in messages. `_LISTS` below has an example list for each type of item.
 _NAMES = {
     int: "a whole number",
     float: "a number",
@@ -20,7 +20,7 @@ _NAMES = {
     bool: "true or false",
     types.NoneType: "null",
 }
-_POWERS = {"k": 3, "M": 6, "G": 9}  # of ten
+_POWERS = {"k": 3, "M": 6, "G": 9}  # the power of ten that a suffix stands for
 _LISTS = {
     int: "[64,64]",
     float: "[0.9,0.8]",
@@ -35,13 +35,13 @@ class ConfigError(ValueError):
 
 
 def options(hint: object) -> tuple[Any, ...]:
-    """Returns the members of a union, or the type itself."""
+    """Returns the members of a union type, or any other type as the only member."""
     is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
     return typing.get_args(hint) if is_union else (hint,)
 
 
 def is_range(hint: object) -> bool:
-    """Returns whether a type is a range (two numbers, the lower first) or a row of more."""
+    """Returns whether a type is a tuple of fixed length: a range (low, high), or more numbers."""
     return typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint)
 
 
@@ -51,15 +51,15 @@ def is_list(hint: object) -> bool:
 
 
 def convert_single(hint: object, value: object, key: str) -> object:
-    """Converts a text, number, true, false, null or range.
+    """Converts plain data to the type of a setting that is no list and no section.
 
     Args:
       hint: the type; it may be a union.
-      value: the data.
+      value: text, a number, true, false, null, or the numbers of a range.
       key: name of the setting in messages.
 
     Raises:
-      ConfigError: if the data is of no such type.
+      ConfigError: if the value does not fit the type.
     """
     if isinstance(value, str) and str in options(hint):
         check_text(key, value)
@@ -93,10 +93,10 @@ def _convert(hint: object, value: object) -> object:
 
 
 def _number(kind: type[int] | type[float], value: object) -> int | float:
-    """Converts a finite number. True and false are not numbers."""
+    """Converts a value to a finite number. True and false do not count as numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError
-    number = kind(value)  # nan and infinity are no integers
+    number = kind(value)  # for integers, this raises an error if the value is nan or infinity
     if number != value if kind is int else not math.isfinite(number):
         raise ValueError
     return number
@@ -107,12 +107,12 @@ def check_text(key: str, text: str) -> None:
 
     Args:
       key: name of the setting in messages.
-      text: a path, a name, or several separated by commas.
+      text: a path or a name, or several of them separated by commas.
 
     Raises:
-      ConfigError: if the text has a control character, too long a name, or no valid Unicode.
+      ConfigError: if the text is no valid Unicode, or has a control character or too long a name.
     """
-    # "Cs" are halves of letters, which UTF-8 cannot hold.
+    # "Cc" are control characters. "Cs" are halves of letters, which UTF-8 cannot hold.
     if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text):
         raise ConfigError(f"{key} is {show(text)}: give UTF-8 text without control characters.")
     longest = max(map(len, re.split(b"[/,]", text.encode())))
@@ -147,7 +147,7 @@ def describe(hint: object, bounds: str = "") -> str:
 
 
 def show(value: object, quote: str = "'") -> str:
-    """Formats a value as it would be typed, and shortens it.
+    """Formats a value as a user would type it, and shortens long text.
 
     Args:
       value: plain data.

@@ -1,5 +1,5 @@
-"""Reports the results of a run as figures and one page, from the files the run wrote. No JAX.
+"""Reports the results of a run as figures and one page, from the files that the run has written.
 
-Imports names and settings from `run`, stages from `task`, the statistics of `evaluate`, and
-`pages`. Start with `rows.read`. `table.py` compares several runs.
+This package imports names and settings from `run`, stages from `task`, the statistics of
+`evaluate`, and `pages`, but not JAX. Read `rows.read` first. `table.py` compares several runs.
 """

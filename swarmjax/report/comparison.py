@@ -1,4 +1,4 @@
-"""Draws the success of several runs over each other with Matplotlib.
+"""Draws the success of several runs into the same panels, with Matplotlib.
 
 The runs differ in lightness and in the style of their lines, so they can also be told apart in grey
 print.
@@ -20,16 +20,17 @@ from swarmjax.report import figures as report_figures
 from swarmjax.report import rows, table
 from swarmjax.report.table import Group, TableLine
 
-_POINTS = 200  # of a curve; each of them is bootstrapped
+_POINTS = 200  # points of a curve; the interval of each point takes a bootstrap
 _STYLES = ("-", "--", "-.", ":")
-_LONGEST = 60  # characters of a place or of settings in the legend
+_LONGEST = 60  # characters of settings, or of directories, in the legend
 
 
 def success(groups: Sequence[Group], stages: Sequence[str]) -> Figure:
-    """Draws the success of each stage in its own panel, with a curve for each group of runs.
+    """Draws the success on each stage in its own panel, with a curve for each group of runs.
 
-    A curve is the interquartile mean over seeds, where every seed has a value. From three seeds on
-    it has its 95 % bootstrap interval. The curriculum of the first run says which success it is.
+    A curve is the interquartile mean over seeds, at the updates where every seed has a value. With
+    three seeds or more, its 95 % bootstrap interval is drawn too. All curves show the kind of
+    success by which the curriculum of the first run decides.
 
     Args:
       groups: runs, in the order of the table.
@@ -50,7 +51,7 @@ def success(groups: Sequence[Group], stages: Sequence[str]) -> Figure:
 
 
 def _joined(group: Group, measure: str, stage: str) -> tuple[np.ndarray, np.ndarray]:
-    """Joins the seeds of runs on a stage, at the updates that all of the runs have done.
+    """Joins the seeds of a group's runs on one stage, at the updates that all runs have done.
 
     Returns:
       Arena control steps [T], and success [N, T].
@@ -82,7 +83,7 @@ def _title(groups: Sequence[Group], name: str) -> str:
 
 
 def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping]) -> None:
-    """Adds the legend, and makes the figure higher by it."""
+    """Adds the legend, and makes the figure higher so that the legend fits."""
     kinds: list[Line2D | Patch] = [
         Line2D([], [], lw=2.0, label=_label(line), **look)
         for line, look in zip(lines, looks, strict=True)
@@ -94,7 +95,7 @@ def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping
 
 
 def _label(line: TableLine) -> str:
-    """Names a curve by its settings, seeds and place."""
+    """Labels a curve with the settings, the number of seeds and the directories of its runs."""
     place, seeds = table.cells(line)[-1], words.count(len(line.seeds), "seed")
     label = f"{line.settings[:_LONGEST]} ({seeds}, {place[-_LONGEST:]})".lstrip()
     return label.replace("$", r"\$")  # else two of them would begin a formula

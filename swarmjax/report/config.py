@@ -15,12 +15,13 @@ class ReportConfig(Section):
     run: str | None = setting(None, "run directory")
     runs: str | None = setting(
         None,
-        "instead of run: run directories, folders of runs (an array, a sweep), "
-        "separated by commas; prints a table with one line for all runs of the same settings, and "
-        "draws their success over each other",
+        "give it instead of run: run directories or folders of runs (an array, a sweep), "
+        "separated by commas; prints a table with one line per group of runs with the same "
+        "settings, and draws the success of all groups into one figure",
     )
     out: str | None = setting(
-        None, "directory of the report; null: report in the run, or beside the first of runs"
+        None,
+        "directory of the report; null: a folder report, in run or beside the first of runs",
     )
 
     def _check(self) -> None:

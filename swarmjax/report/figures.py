@@ -21,7 +21,7 @@ from swarmjax.report import rows as report_rows
 from swarmjax.report.rows import History
 from swarmjax.task.goals.goal import MEASURED
 
-_STRETCHES = 200  # of a curve or band: about one per pixel
+_STRETCHES = 200  # points of a curve or band: about one per pixel
 _SEED, _ALL, _LIMIT = "0.62", "#0b4f9e", "#c04000"
 _CURVES = {
     "return": "return per robot",
@@ -37,12 +37,12 @@ def png_files(history: History) -> dict[str, bytes]:
 
     Returns:
       PNG files by name: `success`; `stages` and `mix` if there are several stages; and `curves`
-      if the run recorded them. The same run gives the same files, since they do not hold
-      Matplotlib's version.
+      if the run recorded their values. The same run always gives the same files, because the files
+      do not hold Matplotlib's version.
     """
     several = {"stages": stages, "mix": mix} if len(history.names) > 1 else {}
     figures = {name: make(history) for name, make in (several | {"curves": curves}).items()}
-    files = {"success": drawing.png(success(history), 2 * drawing.DOTS)}  # it is shown large
+    files = {"success": drawing.png(success(history), 2 * drawing.DOTS)}  # shown large
     return files | {name: drawing.png(each) for name, each in figures.items() if each is not None}
 
 
@@ -68,9 +68,10 @@ def mix(history: History) -> Figure:
 
 
 def success(history: History) -> Figure:
-    """Draws the learning curve: every seed on the last stage and their IQM; the IQM of others.
+    """Draws learning curves: the interquartile mean over seeds on every stage.
 
-    It is small in inches, so that its letters can be read on a telephone.
+    On the last stage, every seed is drawn too. The figure is small in inches, so that its text can
+    be read on a telephone.
     """
     figure, [panel] = over_training(history.arena_steps[-1], [_title(history, -1)])
     figure.set_size_inches(5.2, 3.6)
@@ -86,7 +87,7 @@ def success(history: History) -> Figure:
 
 
 def stages(history: History) -> Figure:
-    """Draws the success of each stage in its own panel: every seed, and their IQM."""
+    """Draws the success on each stage in its own panel: every seed, and the interquartile mean."""
     titles = [_title(history, i) for i in range(len(history.names))]
     figure, panels = over_training(history.arena_steps[-1], titles)
     thresholds = np.broadcast_to(history.config.curriculum.threshold, len(history.names))
@@ -100,9 +101,9 @@ def stages(history: History) -> Figure:
 
 
 def curves(history: History) -> Figure | None:
-    """Draws the learning curves, one panel per quantity: every seed, and their IQM.
+    """Draws a panel for each quantity of `History.curves`: every seed, and the interquartile mean.
 
-    Returns None if the run recorded none of them.
+    Returns None if the run recorded none of these quantities.
     """
     if all(np.isnan(values).all() for values in history.curves.values()):
         return None
@@ -118,12 +119,12 @@ def curves(history: History) -> Figure | None:
 def over_training(
     last_step: int, titles: Sequence[str], *, are_shares: bool = True
 ) -> tuple[Figure, list[Axes]]:
-    """Makes a figure with a panel for each title, over the steps of training.
+    """Makes a figure with a panel for each title. The horizontal axes show the steps of training.
 
     Args:
-      last_step: the last arena control step on the axis that all panels share.
-      titles: of each panel.
-      are_shares: whether the panels share an axis of 0 to 1.
+      last_step: the last arena control step on the horizontal axes.
+      titles: the title of each panel.
+      are_shares: whether the panels show shares, on a common vertical axis from 0 to 1.
     """
     count = len(titles)
     columns = min(count, 3 if count <= report_rows.MANY else 6 if count <= 30 else 8)
@@ -149,18 +150,18 @@ def over_training(
 
 
 def colours(count: int) -> np.ndarray:
-    """Returns colours [count, 4] of stages or runs; a lighter line is hard to see on white."""
+    """Returns colours [count, 4] for stages or runs. None is too light to be seen on white."""
     return colormaps["viridis"](np.linspace(0.0, 0.85, count))
 
 
 def line(panel: Axes, steps: np.ndarray, values: np.ndarray, **look: Any) -> None:
-    """Draws a curve through the values that there are; a single one is a dot."""
+    """Draws a curve through the values that are not nan, or a dot if there is only one."""
     there = ~np.isnan(values)
     panel.plot(steps[there], values[there], marker="o" if there.sum() == 1 else "", **look)
 
 
 def _draw(panel: Axes, steps: np.ndarray, seeds: np.ndarray) -> None:
-    """Draws every seed of values [N, T], and their interquartile mean."""
+    """Draws a curve for each seed of values [N, T], and a curve for the interquartile mean."""
     steps, seeds = _stretched(steps, seeds)
     for values in seeds:
         line(panel, steps, values, color=_SEED, lw=0.7)
@@ -168,21 +169,22 @@ def _draw(panel: Axes, steps: np.ndarray, seeds: np.ndarray) -> None:
 
 
 def _stage_patches(history: History, most: int) -> list[Patch]:
-    """Makes legend entries of at most so many stages, from the last one, which is the goal."""
+    """Makes legend entries for at most `most` evenly spread stages, the last stage first."""
     names, looks = history.labels, colours(len(history.names))
     every = range(len(names) - 1, -1, -math.ceil(len(names) / most))
     return [Patch(color=looks[i], label=names[i]) for i in every]
 
 
 def spread(updates: int, points: int) -> np.ndarray:
-    """Returns the indices of evenly spread points, including the last one."""
+    """Returns at most `points` evenly spread indices of updates, including that of the last."""
     return np.unique(np.linspace(updates - 1, 0, points).round().astype(int))
 
 
 def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Averages values [N or S, T] over stretches of updates; also gives the step where each ends.
+    """Averages values [N or S, T] over stretches of updates.
 
-    Missing values are skipped. A stretch without any value is nan.
+    Returns the step at which each stretch ends, and the means. Missing values are skipped. The mean
+    of a stretch without any value is nan.
     """
     ends = spread(len(steps), _STRETCHES) + 1
     starts = np.concatenate([[0], ends[:-1]])
@@ -192,7 +194,7 @@ def _stretched(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _title(history: History, stage: int) -> str:
-    """Writes a stage's name and last share."""
+    """Writes a stage's name and the success on it after the last update."""
     last, measured = report_rows.among(history.success[:, -1])
     share = f"{100 * last[stage]:.0f} %" if measured[stage] else "not measured"
     return f"{history.labels[stage]}   {share}"

@@ -1,4 +1,4 @@
-"""Builds the page of a report: one self-contained HTML file with its figures inside."""
+"""Builds the page of a report: one self-contained HTML file that includes its figures."""
 
 import os.path
 from collections.abc import Mapping
@@ -28,11 +28,12 @@ def page(
     """Lays out the page.
 
     Args:
-      title: names the run.
+      title: title of the page, which names the run.
       command: the command that makes the report.
       history: the run's history.
-      figures: PNG files by the names of the captions in `captions.html`.
-      replay: the address of the run's replay and the command that writes it, or empty texts.
+      figures: PNG files, by the names that their captions have in `captions.html`.
+      replay: the address of the run's replay, and the command that writes the replay; empty texts
+        if there is none.
       template: the template of the page; it extends `report.html`.
       values: further values for the template.
 
@@ -56,7 +57,7 @@ def page(
 
 
 def _facts(history: History) -> list[tuple[str, str]]:
-    """States the results of a run in two lines, then what it is: heading and text of each line."""
+    """Returns heading and text of each line about a run: two about results, then its settings."""
     trained, names, seeds = history.config, history.labels, history.seeds
     spent = f"{history.updates[-1] + 1:,} of {words.count(trained.updates, 'update')}"
     spent += " (run.stop_at is reached)" if history.has_reached else ""
@@ -80,10 +81,12 @@ def replay(run: Path, out: Path | None = None) -> tuple[str, str]:
 
     Args:
       run: the run directory.
-      out: directory of the page that links to it; None: of a page that is in no directory.
+      out: directory of the page that links to the replay; None if the page is not a file.
 
     Returns:
-      The address of the replay, and the command that writes it; empty where there is none.
+      The replay's address relative to `out`, and the command that writes the replay. The address
+      is empty if there is no replay yet or `out` is None. The command is empty if the run has no
+      policy yet.
     """
     film, policies = run / "replay.html", sorted(run.glob("policy*.npz"))
     address = os.path.relpath(film, out) if out and film.exists() else ""
@@ -108,14 +111,14 @@ def _last_stage(history: History) -> str:
 
 
 def _origin(summary: Row) -> str:
-    """Names the device and the commit that computed a run."""
+    """Names the device that computed a run, and the commit of the code."""
     if not summary:
         return "not recorded before the end of the run"
     return f"{summary.get('device')}, commit {summary.get('commit') or 'unknown'}"
 
 
 def _decisions(history: History) -> list[tuple]:
-    """Makes the table of promotions."""
+    """Returns the rows of the table of promotions."""
     step = history.config.arenas * history.config.algo.rollout_length
     shares = ("targets_reached", "all_reached")
     return [
@@ -132,7 +135,7 @@ def _decisions(history: History) -> list[tuple]:
 
 
 def _stages(history: History) -> list[tuple]:
-    """Makes the table of the stages: what they are, how long they were trained, their success."""
+    """Returns the rows of the table of stages: settings, share of the training, last results."""
     last = {key: report_rows.among(values[:, -1]) for key, values in history.by_stage.items()}
     share = history.mix.mean(axis=(0, 1))
     return [
@@ -152,7 +155,7 @@ def _stages(history: History) -> list[tuple]:
 
 
 def _percent(share: float | None) -> str | None:
-    """Writes a share as a percentage; gives None where it is null or nan."""
+    """Writes a share as a percentage. Returns None if the share is None or nan."""
     return None if share is None or np.isnan(share) else f"{100.0 * share:.1f} %"
 
 

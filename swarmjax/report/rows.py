@@ -1,6 +1,6 @@
-"""Reads the files of a run back as arrays for its report. No JAX.
+"""Reads the files of a run into arrays, for the run's report. Needs no JAX.
 
-Axes: N seeds, T updates, S stages. A missing value is nan here and null in the files.
+Axes: N seeds, T updates, S stages. A missing value is nan in the arrays and null in the files.
 
 A run can be read at any time. A last line without its newline is still being written, or was being
 written when the run was killed, so it is skipped. Any other damage raises an error that names the
@@ -25,12 +25,12 @@ from swarmjax.task.goals.goal import MEASURED
 
 Row = dict[str, Any]
 
-# Each stage's newest verdict, in the order of the stages.
+# Keys of lists with one number per stage, from the newest full group of episodes on that stage.
 BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
 _LISTS = ("mix", *BY_STAGE)
-# Numbers of a whole update; the first two cover the episodes that ended in it.
+# Keys with one number per update. The first two cover the episodes that ended in the update.
 CURVES = ("return", "contacts_per_robot", "policy_loss", "value_loss", "entropy")
-MANY = 9  # with more stages than this, each is drawn small
+MANY = 9  # with more stages than this, the panel of each stage is drawn small
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -46,7 +46,7 @@ def _is_number(value: Any, types: type | UnionType, largest: float) -> bool:
     return isinstance(value, types) and not isinstance(value, bool) and abs(value) <= largest
 
 
-# NumPy holds no larger ones.
+# NumPy's int64 holds no larger whole number.
 COUNT = ValueKind("whole number", lambda each: _is_number(each, int, 2**63 - 1) and each >= 0)
 NUMBER = ValueKind("number", lambda value: _is_number(value, int | float, _LARGEST))
 NUMBER_OR_NULL = ValueKind("number", lambda value: value is None or NUMBER.fits(value))
@@ -56,7 +56,7 @@ FLAG = ValueKind("truth value", lambda value: isinstance(value, bool))
 
 
 def list_of(kind: ValueKind, count: int) -> ValueKind:
-    """Makes the kind of a list with this many values of a kind, at least one."""
+    """Makes the kind of a list with exactly `count` values of a kind; no list fits a count of 0."""
 
     def fits(value: Any) -> bool:
         return isinstance(value, list) and len(value) == count > 0 and all(map(kind.fits, value))
@@ -74,8 +74,8 @@ class History:
       updates: [T], increasing from 0.
       arena_steps: [T] arena control steps of one seed by the end of the update.
       mix: [N, T, S] share of the arenas that were on the stage, 0 to 1.
-      by_stage: [N, T, S] for each name in `BY_STAGE`.
-      curves: [N, T] for each name in `CURVES`, and for the goal's first own measure.
+      by_stage: an array [N, T, S] for each name in `BY_STAGE`.
+      curves: an array [N, T] for each name in `CURVES`, and for the goal's first own measure.
       seconds: training time up to the last update; None if it was not recorded.
       decisions: the curriculum's decisions as recorded, sorted by seed and update.
       summary: the run's summary as recorded; empty before the run ends.
@@ -99,14 +99,18 @@ class History:
 
     @property
     def labels(self) -> list[str]:
-        """Names of the stages in figures: along axes, the values of each stage."""
+        """Names of the stages in figures; with `curriculum.axes`, each stage's values of these."""
         axes, stages = self.config.curriculum.axes, self.config.stage
         values = [[words.setting(getattr(stage, key)) for key in axes] for stage in stages]
         return list(map(" · ".join, values)) if axes else self.names
 
     @property
     def success(self) -> np.ndarray:
-        """The success [N, T, S] the curriculum uses: share of targets, or of whole episodes."""
+        """The success [N, T, S] by which the curriculum decides.
+
+        It is the share of targets that were reached, or the share of episodes in which all robots
+        arrived.
+        """
         return self.by_stage[self.decided_by]
 
     @property
@@ -127,7 +131,7 @@ def read(run: Path) -> History:
     """Reads a run directory.
 
     Raises:
-      ConfigError: if a file is missing or damaged, or a seed has no row.
+      ConfigError: if a file is missing or damaged, or no update has a row of every seed.
     """
     trained = read_config(run)
     by_seed = _read_metrics(run, len(trained.stage))
@@ -157,9 +161,11 @@ def read(run: Path) -> History:
 
 
 def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
-    """Reads what a report needs of each row, by seed and update, as arrays, which need less memory.
+    """Reads the values that a report needs from each row, by seed and update.
 
-    `lists` are the values of `_LISTS`, [K, S], and `curves` those of `CURVES`, with nan for null.
+    They become arrays, which need less memory than lists. `lists` [K, S] has the values of the K
+    keys in `_LISTS`. `curves` has those of `CURVES` and of the goal's first own measure, which
+    `names` lists. nan stands for null.
     """
     by_seed: dict[int, dict[int, Row]] = {}
     for where, row in read_lines(run, METRICS):
@@ -184,15 +190,15 @@ def shared_stages(histories: Sequence[History]) -> list[str]:
 
 
 def measure(history: History) -> str:
-    """Names the quantity in `success`, which the curriculum uses for its decisions."""
+    """Names the quantity that `History.success` holds."""
     by_targets = history.decided_by == "success_by_stage"
     return "targets reached" if by_targets else "episodes in which all arrived"
 
 
 def together(values: np.ndarray) -> np.ndarray:
-    """Takes the interquartile mean over seeds where all of them have a value.
+    """Takes the interquartile mean over seeds at the points where every seed has a value.
 
-    If only some seeds have a value, these are the fast ones, and their mean would be biased.
+    Where only some seeds have a value, these are the fast seeds, whose mean would be biased.
 
     Args:
       values: [N, ...] with nan for a missing value.
@@ -205,10 +211,13 @@ def together(values: np.ndarray) -> np.ndarray:
 
 
 def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Takes the interquartile mean [S] over the seeds that have a value, and counts them [S].
+    """Takes the interquartile mean [S] over the seeds that have a value, and counts these seeds.
 
     Args:
-      values: [N, S] with nan for a missing value. The mean is nan where no seed has a value.
+      values: [N, S] with nan for a missing value.
+
+    Returns:
+      The means [S], nan where no seed has a value, and the counts [S].
     """
     there = ~np.isnan(values)
     mean = [iqm(v[t]) if t.any() else np.nan for v, t in zip(values.T, there.T, strict=True)]
@@ -249,7 +258,7 @@ def read_object(path: Path) -> Row:
     """Reads a file that holds one JSON object.
 
     Raises:
-      ConfigError: if the file cannot be read, or holds something else.
+      ConfigError: if the file cannot be read, or does not hold one JSON object.
     """
     content = reading.read_json(path)
     if not MAP.fits(content):
@@ -278,7 +287,7 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
       A phrase that names the line, and the line's object.
 
     Raises:
-      ConfigError: if the file is missing or cannot be read, or a line holds something else.
+      ConfigError: if the file is missing or cannot be read, or a line is not one JSON object.
     """
     path = run / name
     if not path.exists():
@@ -291,7 +300,7 @@ def read_lines(run: Path, name: str) -> Iterator[tuple[str, Row]]:
 
 
 def _object(line: bytes, where: str) -> Row:
-    """Reads one line."""
+    """Parses a line that should hold one JSON object; `where` names the line in messages."""
     try:
         row = reading.parse_json(line.decode(), where)
     except (ConfigError, UnicodeDecodeError):

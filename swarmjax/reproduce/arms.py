@@ -1,7 +1,7 @@
 """Configures the arms of a reproduction and trains them with the ordinary trainer.
 
-Each arm has its own run directory inside the directory of the reproduction, and continues where it
-stopped.
+Each arm has its own run directory inside the directory of the reproduction. An arm that was stopped
+continues where it stopped.
 """
 
 from pathlib import Path
@@ -15,14 +15,14 @@ from swarmjax.run.settings import TrainConfig
 from swarmjax.run.signals import Stop
 
 PAPER = ("algo=paper",)
-# A million control steps are 244 updates with the default 128 arenas x 32 steps, and 1,953 with
-# these 16 x 32.
+# A million control steps are 244 updates with the default of 128 arenas x 32 steps, and 1,953
+# updates with these 16 arenas x 32 steps.
 MODERN = ("realism=webots", "arenas=16", "algo.rollout_length=32")
 _STAGES = {"curriculum": "paper_curriculum", "baseline": "paper6"}
 
 
 def settings(given: ReproduceConfig, arm: Arm, out: Path) -> TrainConfig:
-    """Makes the config of an arm: of a new run, or of the run that has begun in its directory.
+    """Makes the config of an arm, for a new run or for the run that has begun in its directory.
 
     Args:
       given: settings of the reproduction.
@@ -63,7 +63,7 @@ def run(made: TrainConfig, stop: Stop) -> None:
       stop: watches signals and the time limit.
 
     Raises:
-      ConfigError: if memory is short.
+      ConfigError: if there is too little memory.
       StoppedError: if a stop was requested before the arm began.
       TrainingError: if a loss is no longer finite.
     """

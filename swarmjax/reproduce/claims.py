@@ -1,12 +1,13 @@
-"""Judges the claims in the paper's text with the data of a reproduction. No JAX.
+"""Decides the claims in the paper's text with the data of a reproduction. Needs no JAX.
 
 The criteria that support or contradict a claim were fixed before any data existed;
 `templates/claims.yaml` states them. A claim has one reading for each way to understand the paper
-(docs/paper.md). The first reading is the primary one, named before the data of fifty seeds existed:
-it alone decides, and the others are shown beside it. Every number is an interquartile mean over
-seeds with its 95 % bootstrap interval. A claim is reproduced if its primary reading holds, and not
-reproduced if the data contradict it. It is undecidable if the interval straddles the limit or an
-arm is missing. Below the paper's budget there is no verdict.
+(docs/paper.md). The first reading is the primary reading, which was named before the data of fifty
+seeds existed. It alone decides; the report shows the other readings beside it. Every number is an
+interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if its primary
+reading holds, and not reproduced if the data contradict the primary reading. It is undecidable if
+the interval straddles the limit or an arm is missing. A reproduction with less than the paper's
+budget gives no verdicts.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,13 +23,14 @@ from swarmjax.reproduce.criteria import Criterion, about, crowded, earlier, high
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, PAIR, TUNED, Reproduction
 
-GENERATED = 0.8  # share of targets that counts as the desired behaviour; also promotes from a stage
-FAILED = 0.5  # below this share of targets a swarm fails
+# Share of targets reached that counts as the desired behaviour; also promotes from a stage.
+GENERATED = 0.8
+FAILED = 0.5  # a swarm fails if it reaches a smaller share of its targets
 HELD = {True: "holds", False: "contradicted", None: "open"}
 
-# The value of each seed of an arm, [N]: a function of `measures` with its options set.
+# A function of `measures` with its options set. It returns a value for each seed of an arm, [N].
 type Values = Callable[[Reproduction, str], np.ndarray]
-type Source = tuple[str, Values]  # with its name in words
+type Source = tuple[str, Values]  # the name of such a function in words, and the function
 
 
 class Reading(NamedTuple):
@@ -37,8 +39,8 @@ class Reading(NamedTuple):
     Attributes:
       name: name in words.
       arms: finished arms that the reading needs.
-      values: takes the values of an arm.
-      test: tests the values of the arms, in the order of `arms`.
+      values: returns the values of an arm, [N].
+      test: tests the claim with the values of all arms, in the order of `arms`.
     """
 
     name: str
@@ -67,9 +69,9 @@ class Claim(NamedTuple):
     Attributes:
       name: key of the claim in `claims.yaml`.
       quote: the paper's sentence, word for word.
-      where: where the paper says it.
-      criterion: what supports the claim, and what contradicts it.
-      figures: figures and tables of the report that show it.
+      where: the section of the paper that says it.
+      criterion: what supports the claim, and what contradicts the claim.
+      figures: figures and tables of the report that show whether the claim holds.
       readings: the readings; the first one, the primary reading, decides.
     """
 
@@ -82,7 +84,7 @@ class Claim(NamedTuple):
 
 
 class ClaimVerdict(NamedTuple):
-    """The verdict on a claim: the outcome, why it is open if it is, and the readings' findings."""
+    """The verdict on a claim: the outcome, the reason if it is open, and the readings' findings."""
 
     claim: Claim
     outcome: Literal["reproduced", "not reproduced", "undecidable", "no verdict"]
@@ -91,7 +93,7 @@ class ClaimVerdict(NamedTuple):
 
 
 def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
-    """Judges a claim by its primary reading, unless the runs were too short."""
+    """Decides a claim by its primary reading, unless the runs were too short."""
     findings = tuple(evaluate(data, reading) for reading in claim.readings)
     if data.settings.is_short:
         undecided = tuple(each._replace(holds=None) for each in findings)
@@ -105,7 +107,7 @@ def verdict(data: Reproduction, claim: Claim) -> ClaimVerdict:
 
 
 def evaluate(data: Reproduction, reading: Reading) -> Finding:
-    """Evaluates a reading; it stays open if an arm or an episode is missing."""
+    """Evaluates a reading, which stays open if an arm is missing or a seed has too few episodes."""
     lacking = data.lacking(reading.arms)
     if lacking:
         return Finding(reading.name, None, f"lacks {' and '.join(lacking)}")
@@ -116,7 +118,10 @@ def evaluate(data: Reproduction, reading: Reading) -> Finding:
 
 
 def _final_and_late(key: str, of: Measure) -> list[Source]:
-    """Lists sources on the last stage: the final policies, sampled first, and late training."""
+    """Lists sources of values on the last stage: the final policies, and the end of training.
+
+    The final policies with sampled actions come first, those with mean actions second.
+    """
     late = f"last {measures.WINDOW} episodes of training on {LAST}, sampled actions"
     final = partial(measures.judged, key=key, stage=LAST)
     return [
@@ -139,7 +144,7 @@ def _readings(
 
 
 def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
-    """Lists how to find where success becomes steady, for both readings of success.
+    """Lists the ways to find where success becomes steady, one for each reading of success.
 
     Args:
       stage: uses only the episodes of this stage; None for all.
@@ -162,7 +167,10 @@ def _steady(stage: str | None, axis: Axis) -> list[Source]:
 
 
 def _rewarded() -> list[Source]:
-    """Lists how to find where the last stage's reward nears its best, for robot 1 and the swarm."""
+    """Lists the ways to find where the reward on the last stage nears its best value.
+
+    There are two, for the reward of robot 1 and for the mean reward, in each unit of the place.
+    """
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
     return [
         (
@@ -175,9 +183,10 @@ def _rewarded() -> list[Source]:
 
 
 def _expanded(test: Criterion, which: slice) -> tuple[Reading, ...]:
-    """Makes the readings for the 1.5 m arena: arms that trained on in it first, and zero-shot.
+    """Makes the readings for the 1.5 m arena.
 
-    Figure 9 shows episodes, and "converge" speaks of training.
+    The arms that continued their training in this arena come first, because Figure 9 shows episodes
+    and "converge" speaks of training. The arms that never trained there (zero-shot) come second.
     """
     values = partial(measures.judged, key="targets_reached", stage=EXPANDED)
     by_mean = partial(values, action="mean")

@@ -18,29 +18,36 @@ Arm = Literal[
     "modern_baseline",
 ]
 ARMS: tuple[Arm, ...] = typing.get_args(Arm)
-BUDGET, FINE_TUNE = 1_000_000, 250_000  # control steps of a seed: Table 1; this project's choice
-UPDATE = 6000  # control steps of an update of `algo=paper`; a shorter budget trains nothing
+# Arena control steps of a seed: `BUDGET` is from the paper's Table 1, `FINE_TUNE` our own choice.
+BUDGET, FINE_TUNE = 1_000_000, 250_000
+UPDATE = 6000  # arena control steps per update of `algo=paper`; a smaller budget trains nothing
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReproduceConfig(Section):
-    """Settings to repeat the published experiment with several seeds, as in `algo=paper`."""
+    """Settings to repeat the published experiment (`algo=paper`) with several seeds."""
 
     command: ClassVar[str] = "reproduce"
 
-    seeds: int = setting(10, "seeds of each arm", LEAST_DRAWN, 4096)
-    budget: int = setting(BUDGET, "control steps of a seed; fewer: no verdicts", UPDATE, _MOST)
-    fine_tune: int = setting(FINE_TUNE, "the same at 1.5 m", UPDATE, _MOST)
+    seeds: int = setting(10, "number of seeds of each arm", LEAST_DRAWN, 4096)
+    budget: int = setting(
+        BUDGET, "arena control steps of a seed; below the default: no verdicts", UPDATE, _MOST
+    )
+    fine_tune: int = setting(
+        FINE_TUNE, "like budget, but for the arms NAME_expanded, in the 1.5 m arena", UPDATE, _MOST
+    )
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
-        None, "save and stop after this time; resume continues", above=0.0
+        None, "save and stop after so many minutes; resume=DIR continues", above=0.0
     )
-    out: str | None = setting(None, "directory; null: runs/<date>-<time>-reproduce")
-    resume: str | None = setting(None, "reproduction to continue")
+    out: str | None = setting(
+        None, "directory of the reproduction; null: runs/<date>-<time>-reproduce"
+    )
+    resume: str | None = setting(None, "directory of the reproduction to continue")
 
     @property
     def is_short(self) -> bool:
-        """Whether the arms train for less than the paper's, so that no claim can be judged."""
+        """Whether `budget` or `fine_tune` is below its default, so that no claim is decided."""
         return self.budget < BUDGET or self.fine_tune < FINE_TUNE
 
     def _check(self) -> None:

@@ -1,4 +1,4 @@
-"""Tests whether a claim holds: is the interval of a value or a difference beyond a limit?"""
+"""Tests whether a claim holds: whether the interval of a value or difference is beyond a limit."""
 
 import math
 from collections.abc import Callable
@@ -10,12 +10,13 @@ from swarmjax.evaluate import statistics
 from swarmjax.evaluate.statistics import iqm
 from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 
-# A function of the values [N] of a reading's arms: whether the claim holds, and the numbers.
+# A function that takes the values [N] of each arm of a reading. It returns whether the claim holds
+# (None if undecided), and the numbers as text.
 type Criterion = Callable[..., tuple[bool | None, str]]
 
-ABOUT = 0.5  # "approximately": within this share of the number
+ABOUT = 0.5  # we read "approximately a number" as: at most this share of the number away from it
 # A difference is found with a probability of 0.8 if it is (1.96 + 0.84) standard errors from 0. The
-# interval is 2 * 1.96 of them wide.
+# 95 % interval is 2 * 1.96 standard errors wide.
 _POWER = (1.96 + 0.84) / (2 * 1.96)
 _ROUNDING = 1e-9  # rounding error of a mean: the mean of 0.95, 0.95 and 0.95 is less than 0.95
 
@@ -23,9 +24,9 @@ _ROUNDING = 1e-9  # rounding error of a mean: the mean of 0.95, 0.95 and 0.95 is
 def within(
     *values: np.ndarray, low: float, high: float = math.inf, unit: Unit = SHARE
 ) -> tuple[bool | None, str]:
-    """Tests whether the intervals of all arms lie from `low` to `high`.
+    """Tests whether the intervals of all arms lie between `low` and `high`, which are included.
 
-    An interval that is wholly outside contradicts the claim.
+    An interval that lies wholly outside contradicts the claim.
     """
     low, high = low - _ROUNDING, high + _ROUNDING
     means = [statistics.bootstrap(each[:, None], iqm) for each in values]
@@ -36,12 +37,12 @@ def within(
 
 
 def about(number: float) -> Criterion:
-    """Tests whether a place is approximately this number."""
+    """Makes the criterion that a place is approximately this number."""
     return partial(within, low=(1 - ABOUT) * number, high=(1 + ABOUT) * number, unit=PLACE)
 
 
 def opposite(criterion: Criterion) -> Criterion:
-    """Holds where a criterion is contradicted, and is contradicted where it holds."""
+    """Makes a criterion that holds where the given one is contradicted, and the other way round."""
 
     def test(*values: np.ndarray) -> tuple[bool | None, str]:
         holds, text = criterion(*values)
@@ -51,9 +52,10 @@ def opposite(criterion: Criterion) -> Criterion:
 
 
 def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
-    """Tests whether the first arm has more: the interval of the paired difference is above 0.
+    """Tests whether the first arm has higher values than the second.
 
-    An interval below 0 contradicts the claim.
+    The claim holds if the interval of the paired difference lies above 0. It is contradicted if the
+    interval lies below 0.
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
     both = " against ".join(unit.value(float(iqm(each))) for each in (ours, theirs))
@@ -65,9 +67,9 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     """Tests whether the first arm reaches a goal earlier, where inf means never.
 
-    It takes the probability that a seed of the first arm is earlier than a seed of the second. The
-    claim holds if the interval of this probability lies above 0.5. It is contradicted if the
-    interval lies below 0.5.
+    The test estimates the probability that a seed of the first arm is earlier than a seed of the
+    second arm. The claim holds if the interval of this probability lies above 0.5. It is
+    contradicted if the interval lies below 0.5.
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
     both = " against ".join(PLACE.value(float(iqm(each))) for each in (ours, theirs))
@@ -76,9 +78,11 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
 
 
 def crowded(values: np.ndarray) -> tuple[bool | None, str]:
-    """Tests for crowding; contradicted if the last robot to arrive senses no more than the first.
+    """Tests for crowding, from the results of `measures.crowding`.
 
-    If it senses more, crowding is possible but not proven, so the reading stays open.
+    Crowding is contradicted if the last robot to arrive has no more steps with something in range
+    than the first robot. If it has more, crowding is possible but not proven, so the reading stays
+    open.
     """
     mean = statistics.bootstrap(values[:, None], iqm)
     text = f"{NUMBER.difference(mean)} steps"

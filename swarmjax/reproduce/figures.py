@@ -1,7 +1,7 @@
 """Draws the figures of a reproduction with Matplotlib: the paper's figures and additional ones.
 
-A figure shows those of its arms that have finished. Colours are from Okabe & Ito 2008, "Color
-universal design". Arms also have different dashes.
+A figure shows only the arms that have finished. Colours are from Okabe & Ito 2008, "Color universal
+design". The curves of baselines are also dashed.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
-_POINTS, _RESAMPLES = 100, 1000  # for the interval along a curve
+_POINTS, _RESAMPLES = 100, 1000  # of the interval along a curve: its points, bootstrap resamples
 COLOURS = {"curriculum": "#0072b2", "baseline": "#d55e00"}
 COLOURS |= {f"{arm}_expanded": colour for arm, colour in COLOURS.items()}
 COLOURS |= {"modern_curriculum": "#009e73", "modern_baseline": "#aa4499"}
@@ -35,7 +35,7 @@ _LABELS: dict[Measure, str] = {
 }
 _SHARES = (measures.targets, measures.sensed_share)  # shown in percent
 
-PAPER = {"curriculum": 300, "baseline": 600}  # episodes: section 4, on Figure 6
+PAPER = {"curriculum": 300, "baseline": 600}  # episodes that section 4 of the paper names
 _COLUMNS = 700  # columns of a raster: about one per pixel
 _REACHED = LinearSegmentedColormap.from_list("reached", ["white", "#0b4f9e"])
 _NOTHING, _STEADY = "0.86", "#e69f00"
@@ -49,14 +49,14 @@ class Plot(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """A row of curves: a measure over the episodes of one stage, or of all (None)."""
+    """A row of panels: a measure over the episodes of one stage, or of all if `stage` is None."""
 
     of: Measure
     stage: str | None = None
 
     @property
     def label(self) -> str:
-        """The label of its vertical axis."""
+        """The label of the row's vertical axis."""
         which = "all episodes" if self.stage is None else f"episodes on {self.stage}"
         return f"{_LABELS[self.of]},\n{which}"
 
@@ -87,8 +87,8 @@ def curves(
     Args:
       data: the reproduction's data.
       arms: finished arms; every panel shows all of them.
-      panels: rows, from top to bottom.
-      axes: columns, from left to right.
+      panels: what each row of panels shows, from top to bottom.
+      axes: the unit of the horizontal axis in each column, from left to right.
     """
     height = 1.0 + 2.0 * len(panels)
     figure = Figure(figsize=(drawing.WIDTH, height), layout="constrained")
@@ -137,7 +137,9 @@ def _arm(place: Axes, data: Reproduction, arm: str, panel: Panel, axis: Axis) ->
 
 
 def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str | None) -> Figure:
-    """Draws a line for each episode that reached the goal, one row per seed: Figures 6 and 9.
+    """Draws a line for each episode that reached the goal, as the paper's Figures 6 and 9 do.
+
+    Each seed has a row of its own.
 
     Args:
       data: the reproduction's data.
@@ -232,7 +234,7 @@ _SWARM = (Panel(measures.mean_reward), Panel(measures.mean_reward, LAST))
 _TO_THE_END = (Panel(measures.targets, EXPANDED), Panel(measures.mean_reward, EXPANDED))
 _DEFAULT_TRAINER = (Panel(measures.targets, LAST), _SWARM[1], *_collisions(LAST))
 
-# Their captions are in reproduce.html.
+# The captions of these figures are in reproduce.html.
 PLOTS = {
     "figure6_episodes": Plot(PAIR, partial(raster, axis="episode", stage=None)),
     "figure6_steps": Plot(PAIR, partial(raster, axis="steps", stage=LAST)),

@@ -1,8 +1,8 @@
-"""Judges the policies of a reproduction in MuJoCo's C engine. No JAX.
+"""Evaluates the policies of a reproduction in MuJoCo's C engine. Needs no JAX.
 
-Every policy drives on the last stage and in the 1.5 m arena, by sampled actions and by its mean
-action. PPO-PyTorch, which the paper used, tests by sampled actions. The levels differ only in their
-sensor noise.
+Every policy drives on the last stage and in the 1.5 m arena, each with sampled actions and with its
+mean action. PPO-PyTorch, which the paper used, tests with sampled actions. The levels of a stage
+differ only in their sensor noise.
 """
 
 from pathlib import Path
@@ -18,11 +18,11 @@ from swarmjax.run.load_settings import from_stored
 from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig
 
-EPISODES = 20  # on each stage, of either kind of action
+EPISODES = 20  # for each policy, stage and kind of action
 
 
 class Task(NamedTuple):
-    """A policy to judge on a stage, by actions of one kind."""
+    """A policy to evaluate on one stage with one kind of action."""
 
     arm: str
     seed: int
@@ -32,7 +32,7 @@ class Task(NamedTuple):
 
 
 def judge(task: Task) -> Row:
-    """Judges one policy on one stage; returns a row of `evaluation.json`.
+    """Evaluates one policy on one stage, and returns a row of `evaluation.json`.
 
     Raises:
       PolicyError: if the policy is invalid.

@@ -1,7 +1,7 @@
-"""Measures the episodes of a reproduction: success, its steady state, rolling means.
+"""Measures the episodes of a reproduction: success, when it becomes steady, and rolling means.
 
-Where the paper can be read in two ways (docs/paper.md), each reading has its own function here.
-Axes as in `rows`. No JAX.
+Where the paper can be read in two ways (docs/paper.md), each reading has its own function here. The
+axes of arrays are those of `rows`. Needs no JAX.
 """
 
 import math
@@ -15,47 +15,50 @@ from swarmjax.reproduce.rows import Action, Reproduction, RunLog
 
 WINDOW = 20  # episodes of a rolling mean: "an averaging window of 20 values" (Figure 7)
 STEADY = 0.8  # share of successes in a steady window; the same share promotes from a stage
-KEPT = 0.5  # a later window below this share ends the steady state; `steady` explains why not 0.8
+KEPT = 0.5  # a later window below this share ends the steady state; see `steady` for why not 0.8
 
 type Axis = Literal["episode", "steps"]
-type Measure = Callable[[RunLog], np.ndarray]  # [E] of a log
+type Measure = Callable[[RunLog], np.ndarray]  # returns a value for each episode of a log, [E]
 
 UNITS: dict[Axis, str] = {"episode": "episode number", "steps": "arena steps"}
 AXES: dict[Axis, str] = {"episode": "episode of the run", "steps": "arena control steps"}
 
 
 def first_reached(log: RunLog) -> np.ndarray:
-    """Tells whether [E] robot 1 reached its target: the paper's "the robot"."""
+    """Tells for each episode [E] whether robot 1 (the paper's "the robot") reached its target."""
     return log.reached[:, 0]
 
 
 def all_reached(log: RunLog) -> np.ndarray:
-    """Tells whether [E] every robot that was present reached its target."""
+    """Tells for each episode [E] whether every robot that was present reached its target."""
     return (log.reached | ~log.present).all(axis=1)
 
 
 def targets(log: RunLog) -> np.ndarray:
-    """Computes the share [E] of targets reached: the paper's success rate (section 3.2)."""
+    """Computes the share of targets reached in each episode [E]: the paper's success rate (3.2)."""
     return log.reached.sum(axis=1) / _robots(log)
 
 
 def first_reward(log: RunLog) -> np.ndarray:
-    """Takes the cumulative reward [E] of robot 1, m: Figure 7 is "for one robot"."""
+    """Takes the cumulative reward [E] of robot 1, m. The paper's Figure 7 is "for one robot"."""
     return log.reward[:, 0]
 
 
 def mean_reward(log: RunLog) -> np.ndarray:
-    """Computes the cumulative reward [E], mean over the robots that were present, m."""
+    """Computes the mean cumulative reward [E] of the robots that were present, m."""
     return log.reward.sum(axis=1) / _robots(log)
 
 
 def sensed_share(log: RunLog) -> np.ndarray:
-    """Computes the share [E] of robot steps with something in infrared range: its collisions."""
+    """Computes the share [E] of robot steps with something in infrared range.
+
+    The paper calls these steps collisions.
+    """
     return log.sensed.sum(axis=1) / np.maximum(log.robot_steps.sum(axis=1), 1)
 
 
 def contacts(log: RunLog) -> np.ndarray:
-    """Computes the contacts [E] per robot that was present."""
+    """Computes the number of contacts [E] per robot that was present."""
     return log.contacts.sum(axis=1) / _robots(log)
 
 
@@ -63,7 +66,7 @@ def _robots(log: RunLog) -> np.ndarray:
     return log.present.sum(axis=1)
 
 
-# Two readings of what "reaches the goal" in Figures 6 and 9.
+# Two ways to understand who "reaches the goal" in the paper's Figures 6 and 9.
 SUCCESS: dict[str, Measure] = {
     "robot 1 reached its target": first_reached,
     "all robots reached their targets": all_reached,
@@ -78,7 +81,8 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
       window: number of values per mean.
 
     Returns:
-      [E - window + 1], starting at value number `window`; empty if there are fewer values.
+      [E - window + 1] means. The first is that of the first `window` values. Empty if there are
+      fewer values than `window`.
     """
     if len(values) < window:
         return np.zeros(0)
@@ -88,13 +92,13 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
 def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> int | None:
     """Finds where success becomes steady.
 
-    This is the first episode that meets three conditions. The window that starts there has at least
-    `share` successes. So do all episodes from there to the end of the run, taken together. No later
-    window has less than `KEPT`.
+    This is the first episode that meets three conditions. In the window that starts with this
+    episode, at least `share` of the episodes succeed. The same holds for all episodes from this one
+    to the end of the run, taken together. In no later window do fewer than `KEPT` of them succeed.
 
-    Later windows need not have `share`, because such a rule would measure the length of the run. A
+    Later windows need not reach `share`, because such a rule would measure the length of the run: a
     policy that succeeds in nine of ten episodes has fewer than 16 successes in one of 23 windows,
-    so some window near the end of any run would fail.
+    so some window near the end of any run would break the rule.
 
     Args:
       success: [E] whether an episode succeeded.
@@ -115,14 +119,14 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
 
 
 def along(log: RunLog, axis: Axis) -> np.ndarray:
-    """Places the episodes [E]: their numbers in the run, or the arena steps when they ended."""
+    """Returns the place of each episode [E]: its number in the run, or arena steps at its end."""
     return log.number if axis == "episode" else log.arena_steps
 
 
 def steady_at(
     data: Reproduction, arm: str, *, success: Measure, axis: Axis, stage: str | None
 ) -> np.ndarray:
-    """Finds where success becomes steady, by seed.
+    """Finds for each seed where its success becomes steady.
 
     Args:
       data: the reproduction's data.
@@ -152,7 +156,7 @@ def late(data: Reproduction, arm: str, *, of: Measure, stage: str) -> np.ndarray
       stage: the stage; its last `WINDOW` episodes are used.
 
     Returns:
-      [N] by seed; nan for a seed with fewer episodes on the stage.
+      [N] means; nan for a seed with fewer than `WINDOW` episodes on the stage.
     """
     means = [rolling(np.asarray(of(log.on(stage)), float)) for log in data.logs[arm]]
     return np.array([each[-1] if len(each) else np.nan for each in means])
@@ -161,14 +165,15 @@ def late(data: Reproduction, arm: str, *, of: Measure, stage: str) -> np.ndarray
 def judged(
     data: Reproduction, arm: str, *, key: str, stage: str, action: Action = "sampled"
 ) -> np.ndarray:
-    """Takes a result [N] of the final policies on a stage."""
+    """Returns one measure of an arm's final policies on a stage, by seed [N]."""
     return data.judged[arm, stage, action][key]
 
 
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
-    """Counts in how many more steps the last robot to arrive sensed something than the first one.
+    """Counts how many more steps with something in range the last robot had than the first robot.
 
-    The first robot finds no other robot at the targets. The last one finds all that arrived before.
+    First and last are meant by arrival. The first robot finds no other robot at the targets. The
+    last robot finds all the others that have arrived.
 
     Args:
       data: the reproduction's data.
@@ -176,7 +181,7 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
       stage: the stage. Of the last `WINDOW` episodes, those with two or more arrivals are used.
 
     Returns:
-      [N] robot steps per pair, mean by seed; nan for a seed without such an episode.
+      [N] mean difference of a seed's episodes, robot steps; nan for a seed without such an episode.
     """
     differences = []
     for log in data.logs[arm]:
@@ -194,14 +199,14 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
 def reward_reached(
     data: Reproduction, arm: str, *, of: Measure, axis: Axis, rivals: Sequence[str], stage: str
 ) -> np.ndarray:
-    """Finds where the rolling mean of the reward first reaches 0.9 of the best of all rivals.
+    """Finds where an arm's rolling mean of the reward first reaches 0.9 of the best rolling mean.
 
     Args:
       data: the reproduction's data.
       arm: one of the rivals.
       of: takes the reward [E] from a log.
       axis: unit in which places are counted from the beginning of the run.
-      rivals: finished arms; the best mean is searched over all their seeds.
+      rivals: finished arms. The best rolling mean is the highest one of all their seeds.
       stage: uses only the episodes of this stage.
 
     Returns:
@@ -220,14 +225,15 @@ def reward_reached(
 def on_grid(
     curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Samples curves at common points; a value holds until the next one.
+    """Samples curves at common places. Between two places of a curve, the earlier value holds.
 
     Args:
       curves: non-decreasing places [E] and values [E] of each seed.
       points: maximum number of points.
 
     Returns:
-      Places [P], whole numbers, and values [N, P]; None if a curve is empty or they do not overlap.
+      Places [P], whole numbers, and values [N, P]. None if a curve is empty, or if the curves do
+      not overlap.
     """
     if not all(len(at) for at, _ in curves):
         return None
@@ -240,12 +246,12 @@ def on_grid(
 
 
 class Unit(NamedTuple):
-    """Writes values of a unit.
+    """Writes values with their unit.
 
     Attributes:
       number: writes a value without its unit.
-      suffix: the unit.
-      apart: the unit of a difference of two values.
+      suffix: the unit to write after a value.
+      apart: the unit to write after a difference of two values.
     """
 
     number: Callable[[float], str]
@@ -266,7 +272,7 @@ class Unit(NamedTuple):
         return f"{estimate}{self.apart} ({low} to {high})"
 
     def _signed(self, value: float) -> str:
-        """Writes a difference with its sign, without a sign if the text is all zeros."""
+        """Writes a difference with its sign, or without a sign if it is rounded to 0."""
         plain = self.number(abs(value))
         if not any(digit in plain for digit in "123456789"):
             return plain
@@ -274,10 +280,10 @@ class Unit(NamedTuple):
 
 
 SHARE = Unit(lambda share: f"{100 * share:.1f}", " %", " points")
-# An episode number or arena steps; inf means never.
+# Writes an episode number or a number of arena steps. inf means never.
 PLACE = Unit(lambda place: "never" if math.isinf(place) else f"{place:,.0f}")
 NUMBER = Unit(lambda value: f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}")
-# What the table of final policies shows of `JUDGED`.
+# The measures of `JUDGED` in the table of final policies, each with its heading and unit.
 FINAL: dict[str, tuple[str, Unit]] = {
     "targets_reached": ("targets reached", SHARE),
     "all_reached": ("episodes in which all arrived", SHARE),

@@ -18,7 +18,7 @@ from swarmjax.reproduce.measures import FINAL, PLACE, Unit
 from swarmjax.reproduce.rows import ARMS, LAST, MODERN, PAIR, Reproduction
 
 PAGE, FIGURES = "report.html", "figures"
-# Both readings of success, over all episodes and over those on the last stage.
+# Both readings of success, each over all episodes and over the episodes on the last stage.
 _CASES = (*claims.steady(None, "episode"), *claims.steady(LAST, "steps"))
 _OUTCOMES = ("reproduced", "not reproduced", "undecidable")
 
@@ -49,7 +49,7 @@ def write(out: Path) -> Path:
 def _page(
     data: Reproduction, figures: Mapping[str, bytes], lacks: Mapping[str, Sequence[str]]
 ) -> str:
-    """Lays out the page, from PNG files by name and the arms that each figure lacks."""
+    """Lays out the page, from PNG files by name and lists of the arms that each figure lacks."""
     verdicts = [claims.verdict(data, claim) for claim in claims.CLAIMS]
     outcomes = [each.outcome for each in verdicts]
     places = [
@@ -92,10 +92,13 @@ def _mean(values: np.ndarray, unit: Unit) -> str:
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Writes median and IQM of places, and how many seeds have a place; inf means none."""
+    """Writes the median and the interquartile mean of places, and how many seeds have a place.
+
+    A seed without a place has inf.
+    """
     return (
         PLACE.value(float(np.median(places))),
         _mean(places, PLACE),
-        # No bootstrap: if all ten seeds become steady, its interval would be 100 to 100 %.
+        # No bootstrap interval: if all ten seeds became steady, it would be 100 to 100 %.
         f"{np.isfinite(places).sum()} of {len(places)}",
     )

@@ -1,8 +1,9 @@
-"""Reads the files of a reproduction of the paper back as arrays for its report. No JAX.
+"""Reads the files of a reproduction of the paper into arrays, for the report. Needs no JAX.
 
-Axes: N seeds, E episodes of a seed, R robots (most of any episode). An arm is one way to train. An
-unfinished arm is left out, and the report names each figure that lacks it. If a finished arm lacks
-an episode log, a seed or its evaluation, an error names the file and the arm.
+Axes: N seeds, E episodes of a seed, R robots (the largest number in any episode). An arm is one way
+to train. An unfinished arm is left out, and the report names the figures in which the arm is
+missing. If a finished arm lacks an episode log, a seed or its evaluation, an error names the file
+and the arm.
 """
 
 import itertools
@@ -21,17 +22,17 @@ from swarmjax.run.directory import SUMMARY, has_ended
 from swarmjax.run.recorder import EPISODES
 
 FACTS, EVALUATION = "reproduce.json", "evaluation.json"
-FORMAT = 4  # of both files
+FORMAT = 4  # format of both files
 _LAST_READER = "8820a9f"  # the last commit that reads format 3
-LAST, EXPANDED = "paper6", "paper_expanded"  # the stages that policies are judged on
+LAST, EXPANDED = "paper6", "paper_expanded"  # stages of the evaluation
 Action = Literal["sampled", "mean"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
 PAIR = ("curriculum", "baseline")
 TUNED = ("curriculum_expanded", "baseline_expanded")
 MODERN = ("modern_curriculum", "modern_baseline")
-# Keys of a row of the evaluation. Each is measured over the row's episodes.
+# Keys of a row of the evaluation. Each value is measured over all episodes of the row.
 JUDGED = ("targets_reached", "all_reached", "sensed_share", "contacts_per_robot")
-# The kind of each value of a robot in `episodes.jsonl`.
+# The kind of the values with one entry per robot in `episodes.jsonl`.
 _BY_ROBOT = {
     "reached": report_rows.FLAG,
     "reward": report_rows.NUMBER,
@@ -43,7 +44,7 @@ _BY_ROBOT = {
 class RunLog:
     """Episodes of one seed, in the order in which they ended.
 
-    For an absent robot `reached` is False and all values below it are 0.
+    For an absent robot, `reached` is False and all fields after it are 0.
 
     Attributes:
       number: [E] number of the episode in its run, from 1, increasing.
@@ -51,11 +52,11 @@ class RunLog:
       stage: [E] name of the stage.
       present: [E, R] whether the robot was present.
       reached: [E, R] whether the robot reached its target.
-      reward: [E, R] sum over the episode, undiscounted, m.
+      reward: [E, R] undiscounted sum of the robot's rewards over the episode, m.
       robot_steps: [E, R] control steps before the robot arrived.
-      sensed: [E, R] how many of `robot_steps` had something in infrared range: the paper's
-        collisions.
-      contacts: [E, R] contacts that the robot began or met.
+      sensed: [E, R] how many of the `robot_steps` had something in infrared range. The paper calls
+        these steps collisions.
+      contacts: [E, R] number of the robot's contacts, whichever side began them.
     """
 
     number: np.ndarray
@@ -72,11 +73,11 @@ class RunLog:
         return len(self.number)
 
     def on(self, stage: str | None) -> "RunLog":
-        """Selects the episodes of one stage, with their numbers in the whole run; None for all."""
+        """Selects the episodes of one stage, with their numbers in the run. None selects all."""
         return self if stage is None else self.where(self.stage == stage)
 
     def where(self, chosen: np.ndarray) -> "RunLog":
-        """Selects the episodes of a mask [E]."""
+        """Selects the episodes where a mask [E] is True."""
         return RunLog(**{name: values[chosen] for name, values in vars(self).items()})
 
 
@@ -85,8 +86,8 @@ class Reproduction:
     """The results of a reproduction.
 
     Attributes:
-      settings: its settings.
-      versions: versions of the software that computed it, by name.
+      settings: settings of the reproduction.
+      versions: versions of the software that computed the results, by name.
       summaries: `summary.json` of each finished arm.
       logs: N logs of each finished arm.
       judged: [N] values by finished arm, stage and kind of action, for each name in `JUDGED`.
@@ -163,7 +164,9 @@ def summaries(out: Path) -> dict[str, Row]:
 
 
 def read_rows(out: Path) -> list[Row]:
-    """Reads `evaluation.json`: a row for each policy and stage; none if it does not exist yet.
+    """Reads the rows of `evaluation.json`, or returns no rows if the file does not exist yet.
+
+    There is a row for each policy, stage and kind of action.
 
     Raises:
       ConfigError: if the file is damaged or has another format.
@@ -183,7 +186,7 @@ def read_rows(out: Path) -> list[Row]:
 
 
 def _read_object(path: Path) -> Row:
-    """Reads one of the two files of `FORMAT`."""
+    """Reads `reproduce.json` or `evaluation.json`, and checks its format."""
     content = report_rows.read_object(path)
     if content.get("format") != FORMAT:
         raise ConfigError(
@@ -234,7 +237,7 @@ def _log(rows: list[Row]) -> RunLog:
 def _read_judged(
     out: Path, arms: Sequence[str], seeds: Sequence[int]
 ) -> dict[tuple[str, str, Action], dict[str, np.ndarray]]:
-    """Reads the results of the final policies of finished arms."""
+    """Reads the evaluation of the final policies of finished arms, as in `Reproduction.judged`."""
     keys = ("arm", "stage", "action", "seed")
     rows = {tuple(row[key] for key in keys): row for row in read_rows(out)}
     judged = {}
