@@ -118,14 +118,12 @@ def test_such_a_run_that_is_resumed_says_so_and_stays_as_it_is(
     monkeypatch.setattr(Run, "compile", lambda _: pytest.fail("nothing to compile"))
     before = _contents(stopped)
     assert train.main([f"resume={stopped}", *words]) == 0
-    *said, last = capsys.readouterr().out.splitlines()
+    said = " ".join(capsys.readouterr().out.split())  # long lines are broken
     reached = f"every seed has reached run.stop_at={show(goal)}"
     more = "for more, give a larger one, or run.stop_at=null"
     assert f"nothing left to train: {reached}; {more}" in said
     updates = 15_625 if words else UPDATES
-    assert last.startswith(
-        f"done after update {end} of {updates:,}, as {reached}; judge each of 2 policies with: "
-    )
+    assert f"done after update {end} of {updates:,}, as {reached}; judge each of 2 policies" in said
     assert _contents(stopped) == before
 
 
