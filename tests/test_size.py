@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
-    "code lines of swarmjax": 19_192,
+    "code lines of swarmjax": 19_210,
     "code lines of benchmarks": 4_500,
     "keys of train": 141,
     "longest file": 450,
