@@ -1,14 +1,16 @@
 """E-puck swarms in MuJoCo MJX: thousands of arenas, a curriculum and PPO in one compiled program.
 
 Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. They raise
-`SwarmjaxError` for what they refuse. Importing this package imports neither JAX nor NumPy.
+`SwarmjaxError` if an argument is invalid or a run breaks. Importing this package imports neither
+JAX nor NumPy.
 
-Every docstring uses these axes: `T` time, `A` arenas, `R` robots (max), `K` infrared sensors,
-`O` observation, `U` = 2 command, `M` obstacles (max), `S` stages, `L` learners (1 when the policy
-is shared, R when every robot has its own). Units are SI. Angles are in radians and
-counter-clockwise, and x points forward. A step is always qualified: a physics step, a control step
-(one per arena), a robot step (a control step of one robot), a transition (a robot step that was
-trained on).
+Every docstring uses these axes: `T` time, `A` arenas, `R` robots (the most in an arena), `K`
+infrared sensors, `O` observation entries, `U` = 2 entries of an action or command, `M` obstacles
+(the most in an arena), `S` stages, `L` learners (1 if all robots share the policy, R if every robot
+has its own). Units are SI. Angles are in radians and counter-clockwise, and x points forward. There
+are several kinds of steps: a physics step; a control step, which moves all robots of an arena; a
+robot step, which is a control step of one robot; and a transition, which is a robot step that was
+trained on.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -55,7 +55,7 @@ def _one_error[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return function(*args, **kwargs)
-        except OSError:  # perhaps of a function that the caller has given
+        except OSError:  # perhaps from a function that the caller has given
             raise
         except Exception as error:
             found = command.explain(error, (CheckpointError, TrainingError))
@@ -133,13 +133,13 @@ def train_policy(
         result = swarmjax.train_policy({"stage": "s3", "arenas": 64, "budget": 500_000})
 
     Args:
-      settings: keys of the command and their values, as `{"algo.discount": 0.995}`; `stage` may
-        also be a `StageConfig` or a list of them.
+      settings: keys of the command and their values, as in `{"algo.discount": 0.995}`. The value
+        of `stage` may also be a `StageConfig` or a list of them.
       on_update: called with each row of `metrics.jsonl`. If it returns True, the run saves and
         stops, as it does on Ctrl-C.
-      log: a list of `Logger`s of `swarmjax.run.loggers`. Each is called in its own thread, so the
-        run does not wait for it. If it raises, a warning is printed to standard error and the run
-        continues without it.
+      log: a list of `Logger`s of `swarmjax.run.loggers`. Each logger is called in its own thread,
+        so the run does not wait for it. If a logger raises an error, a warning is printed to
+        standard error and the run continues without this logger.
       extensions: your own extension pieces: a file, a module, or a list of them.
 
     Returns:
@@ -184,17 +184,20 @@ def evaluate_policy(
         found = swarmjax.evaluate_policy(result.policy, stage="s6", episodes=100)
         found["cells"][0]["measures"]["targets_reached"]["mean"]
 
-    The policy plays with the robot, task and realism that it was trained with, but on the wheeled
-    body.
+    The evaluation uses the robot, task and realism that the policy was trained with, but the robot
+    has the wheeled body.
 
     Args:
-      policy: a `Policy`, the path of a policy file, or a list of these from the same recipe.
-      suite: a name of `configs/suites/`, or the path of a file; give it instead of a stage.
-      stage: a name, a path or a `StageConfig`; None: the last stage that the policy was trained on.
+      policy: a `Policy`, the path of a policy file, or a list of policies or paths from the same
+        training settings.
+      suite: a name of `configs/suites/`, or the path of a file. Give either `suite` or `stage`.
+      stage: a name, a path or a `StageConfig`. Without `suite`, None means the last stage that the
+        policy was trained on.
       extensions: pieces that the policy needs: a file, a module, or a list of them.
       workers: number of processes. Each additional process imports the calling script again, so
         that script needs `if __name__ == "__main__":`.
-      settings: further keys of the command, as in `episodes=100` or `realism="real"`.
+      settings: further keys of the command and their values, as in `episodes=100` or
+        `realism="real"`.
 
     Returns:
       The contents of `result.json` (docs/interface.md).
@@ -230,7 +233,8 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
     Args:
       path: path of the file.
-      extensions: a file, a module or a list with the policy's own network, if it has one.
+      extensions: a file, a module or a list of pieces with the policy's own network, if the policy
+        has one.
 
     Raises:
       SwarmjaxError: the file is missing, damaged or inconsistent.
@@ -239,7 +243,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Returns settings as command-line words, and the stages that no word can name."""
+    """Returns settings as command-line words. Returns stages apart if no word can name them."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))

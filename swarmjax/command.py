@@ -38,7 +38,7 @@ def run(
       also: types of further errors that the user can fix.
 
     Returns:
-      The exit code: 2 for the user's errors, which are printed in one sentence.
+      The exit code. It is 2 for the user's errors, each of which is printed as one sentence.
     """
     module, arguments = _module(name), sys.argv[1:]
     try:
@@ -65,14 +65,14 @@ def run(
 
 
 def explain(error: Exception, also: tuple[type[Exception], ...] = ()) -> tuple[str, int] | None:
-    """Describes an error that the user can mend.
+    """Describes an error that the user can fix.
 
     Args:
       error: the error.
       also: types of further errors that the user can fix.
 
     Returns:
-      One sentence, and the exit code of a command; None for any other error.
+      One sentence, and the exit code of a command. None for an error that the user cannot fix.
     """
     if isinstance(error, (ConfigError, PolicyError, *also)):
         return str(error), USER_ERROR
@@ -90,13 +90,13 @@ def line(name: str, *arguments: str) -> str:
 
     Args:
       name: name of the command, such as `evaluate`.
-      arguments: its `key=value` words.
+      arguments: the command's `key=value` words.
     """
     return shlex.join(["python", "-m", f"swarmjax.{name}", *arguments])
 
 
 def _module(name: str) -> str:
-    """Returns the name for `python -m`, or a script's path for a command outside the package."""
+    """Returns a command's name for `python -m`, or the path of a script outside the package."""
     main = sys.modules["__main__"]
     script = getattr(main, "__file__", None) or ""
     spec = getattr(main, "__spec__", None)
@@ -112,8 +112,8 @@ def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> st
     Args:
       cls: the command's dataclass.
       module: name for `python -m`, such as `swarmjax.train`, or a script's path.
-      topics: sections or keys to list, or `all`. Without topics, the text has usage, examples,
-        groups and the keys outside sections.
+      topics: sections or keys to list, or `all`. Without topics, the text has the usage, examples,
+        groups, and the keys that are outside sections.
 
     Returns:
       Lines for a terminal, without a newline at the end.
@@ -125,7 +125,7 @@ def help_text(cls: type[Section], module: str, topics: Sequence[str] = ()) -> st
 
 
 def _listed(cls: type[Section], topics: Sequence[str]) -> list[str]:
-    """Lists the keys of topics."""
+    """Describes the keys that the topics name, one line per key."""
     known = section.keys(cls)
     chosen: set[str] = set()
     for topic in topics:
@@ -153,7 +153,7 @@ def _examples(module: str) -> list[str]:
 
 
 def _overview(cls: type[Section], module: str) -> list[str]:
-    """Describes how to use a command, without the keys of its sections."""
+    """Describes how to use a command, but does not list the keys inside its sections."""
     command = f"python {module}" if module.endswith(".py") else f"python -m {module}"
     top = [key for key in section.keys(cls) if "." not in key]
     blocks = (
@@ -169,7 +169,7 @@ def _overview(cls: type[Section], module: str) -> list[str]:
 
 
 def _describe_sections(cls: type[Section]) -> list[str]:
-    """Returns a line for each section of keys, with the first sentence about it."""
+    """Returns a line for each section of keys, with the first line of the section's docstring."""
     lines = []
     for name, each in section.sections(cls).items():
         meaning = (inspect.getdoc(each) or "").partition("\n")[0].rstrip(".:;")

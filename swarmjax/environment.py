@@ -25,7 +25,8 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-_REDRAW = 32  # control steps in which every waiting level is replaced once; episodes take longer
+# Every waiting level is replaced once in this many control steps. Episodes take longer.
+_REDRAW = 32
 
 
 class Space(NamedTuple):
@@ -35,8 +36,8 @@ class Space(NamedTuple):
       shape: shape of the array.
       names: names of its entries.
       units: units of its entries.
-      low: least value of each entry; None without a limit.
-      high: largest value of each entry; None without a limit.
+      low: smallest value of each entry; None if there is no limit.
+      high: largest value of each entry; None if there is no limit.
     """
 
     shape: tuple[int, ...]
@@ -53,7 +54,7 @@ class SwarmState:
     Attributes:
       arenas: [A] the arenas; `arenas.observation` [A, R, O] is the policy's input, and
         `arenas.level` the levels that the episodes started from.
-      waiting: [A] the episodes that begin next.
+      waiting: [A] the episode that begins next in each arena.
       key: random key of future levels.
       clock: [] control steps since `reset`, int32.
     """
@@ -65,7 +66,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """Input of the policy, [A, R, O]; where an episode has ended, that of the new episode."""
+        """Input of the policy, [A, R, O]. If an arena's episode has ended, the next one's input."""
         return self.arenas.observation
 
     @property
@@ -136,13 +137,13 @@ class Swarm:
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
         """Advances all arenas by one control step; an arena whose episode ends starts a new one.
 
-        Where `done` is true, the returned state belongs to the next episode, while the step's
-        observation is the last one of the old episode. The levels of the next episodes are drawn
-        ahead, and each is redrawn every 32 steps. An arena that ends two episodes within 32 steps
-        plays the same level again.
+        Where `done` is true, the returned state belongs to the next episode, while the observation
+        in the returned outcome is the last one of the old episode. The levels of the next episodes
+        are drawn ahead, and each of them is drawn again every 32 control steps. An arena that ends
+        two episodes within 32 control steps plays the same level again.
 
         Args:
-          state: before the step.
+          state: the state before the step.
           action: [A, R, U], clipped to -1..1; -1 and 1 are the ends of each command's range.
 
         Returns:
@@ -159,14 +160,14 @@ class Swarm:
         return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
 
     def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
-        """Replaces a few of the waiting episodes, each in its turn."""
+        """Replaces a few of the waiting episodes. All arenas take turns."""
         count = -(-self.num_arenas // _REDRAW)
         which = (clock * count + jnp.arange(count)) % self.num_arenas
         fresh = self._draw(key, which)
         return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
 
     def _draw(self, key: Array, arena: Array) -> EnvState:
-        """Starts one episode in each of these arenas [N]; `sim` is then a `PhysicsState`."""
+        """Starts one episode in each of the arenas [N]. The result's `sim` is a `PhysicsState`."""
         spacing, stages = self.world.spacing, jax.tree.map(jnp.asarray, self.stages)
         count = len(self.stages.robots)
 

@@ -9,21 +9,21 @@ import math
 
 HULL_RADIUS = 0.037  # m; Webots E-puck, collision cylinder
 HULL_BOTTOM = 0.0025  # m; lower end of the same cylinder (centre 0.025, height 0.045)
-HULL_TOP = 0.0475  # m; its upper end
+HULL_TOP = 0.0475  # m; upper end of the same cylinder
 MASS = 0.16  # kg; Webots e-puck guide, version 1: body 0.15 and two wheels of 0.005
 # kg m^2; the body has 9.78585e-5 about its vertical axis. Two wheels of 5 g, 0.026 m off the axis,
 # add 2 * 0.005 * 0.026**2 = 6.8e-6. Each wheel also adds 5.1e-7 about its own axis. The total is
 # 1.06e-4.
 YAW_INERTIA = 1.06e-4
 WHEEL_MASS = 0.005  # kg, each; Webots E-puck
-# The whole body, for `robot=wheeled`: Webots E-puck, version 1, without its wheels. The moments are
-# in the order of the older model file, with y up; the newer file, with z up, has them in the same
-# order.
+# The whole body without its wheels, for `robot=wheeled`: Webots E-puck, version 1. The moments are
+# in the order of the older model file, in which y is up. The newer file, in which z is up, has them
+# in the same order.
 BODY_INERTIA = (8.64333e-5, 8.74869e-5, 9.78585e-5)  # kg m^2 about x, y, z of the centre of mass
 COM_HEIGHT = 0.015  # m; height of the centre of mass, exactly over the axle
-SKID_X = 0.025  # m; front and back end of the box that it skids on (0.05 long)
+SKID_X = 0.025  # m; x of the front end of the box on which the robot skids; its back end is at -x
 SKID_CLEARANCE = 0.0001  # m; from the floor to the lower face of that box
-AXLE_Y = 0.026  # m; centres of the wheels left and right of the middle
+AXLE_Y = 0.026  # m; distance of the centre of each wheel from the middle of the robot
 WHEEL_INERTIA = (5.1e-7, 1.0e-6, 5.1e-7)  # kg m^2; cylinder of 5 g, radius 0.02, width 0.005 m
 ENCODER_STEP = 0.00628  # rad; Webots E-puck, 2 pi / 1000
 WHEEL_RADIUS = 0.020  # m; Webots E-puck
@@ -67,7 +67,8 @@ INFRARED_TABLE = (
     (0.060, 104.09, 0.03065),
     (0.070, 67.19, 0.04897),
 )
-# Counts of ps0..ps7 of one e-puck, before zeroing, with an object 0, 1, .. 7 cm from its hull.
+# Counts of ps0..ps7 of one e-puck, from which no offset is subtracted, with an object at 0, 1, .. 7
+# cm from the robot's hull.
 # Source: sensorMean.txt and sensorVar.txt of mohammad7t/Particle-Filter-for-e-puck-on-Webots,
 # commit 0de64e89; sensorVar.txt holds standard deviations. We infer that the robot was a real one,
 # since each sensor has its own offset.
@@ -95,9 +96,9 @@ MEASURED_INFRARED_SD = (
 # The curve A / (gap + d)^2 + b of ps0..ps7: A (counts m^2), d (m), b (counts). The curve was fitted
 # to the means at 1 to 7 cm by least squares, weighted by the standard deviations. No residual may
 # exceed 13 counts. This limit affects only ps0, which has a residual of 13.1 counts without the
-# limit. The fourth column is the median of those standard deviations (counts). The last column is
-# the mean at 0 cm, which is the largest reading (counts). tests/sim/test_response.py repeats the
-# fit.
+# limit. The fourth column is the median of the standard deviations at 1 to 7 cm (counts). The last
+# column is the mean at 0 cm, which is the largest reading (counts). tests/sim/test_response.py
+# repeats the fit.
 INFRARED_FIT = (
     (0.16935, 0.0034172, 442.63, 12.06, 3779.0),
     (0.18230, 0.0015093, 179.89, 3.58, 3810.0),

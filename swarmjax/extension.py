@@ -1,10 +1,10 @@
-"""Your own pieces: rewards, observations, levels, networks, curricula and goals, from a file.
+"""Loads your own pieces from a file: rewards, observations, levels, networks, curricula and goals.
 
 A piece is a function with one of the decorators below; a network is a Flax module, and a goal a
 class. Commands take the file as `extensions=FILE`. `make_env` and `train_policy` also take a module
 or a list of pieces. All pieces of a file are used unless a setting says otherwise.
 docs/extending.md and examples/own_pieces.py have an example of each kind. Loading a file executes
-it. Importing this module does not import JAX.
+the code in the file. Importing this module does not import JAX.
 """
 
 import ast
@@ -51,7 +51,7 @@ class Piece:
     Attributes:
       kind: the kind of piece, as messages and policy files call it.
       name: name of the piece in settings and policy files.
-      function: the function.
+      function: the function or class.
     """
 
     kind: ClassVar[str] = ""
@@ -61,7 +61,7 @@ class Piece:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the piece's code and of what it uses from its file, without comments."""
+        """SHA-256 of the piece's code and of all that it uses from its file, without comments."""
         texts = sorted(_sources(self.function, {}).items())
         return hashlib.sha256(repr(texts).encode()).hexdigest()
 
@@ -91,7 +91,7 @@ class Observation(Piece):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of its entries."""
+        """Names of the entries."""
         if self.size == 1:
             return (self.name,)
         return tuple(f"{self.name}_{i}" for i in range(self.size))
@@ -162,7 +162,7 @@ def level_drawing(function: Callable) -> LevelDrawing:
 def network(module: type) -> Network:
     """Turns a Flax module into a network for actor and critic; `algo.network` selects it.
 
-    The name is that of the class in lower case, so that ResidualNet is residual_net.
+    The network has the name of the class in snake case: ResidualNet becomes residual_net.
     """
     return Network(name=_snake_case(module), function=module)
 
@@ -175,7 +175,7 @@ def curriculum(function: Callable) -> OwnCurriculum:
 def goal(goal: type) -> OwnGoal:
     """Turns a subclass of `swarmjax.task.goals.goal.Goal` into a goal; `task.goal` selects it.
 
-    The name is that of the class in lower case, so that KeepApart is keep_apart.
+    The goal has the name of the class in snake case: KeepApart becomes keep_apart.
     """
     return OwnGoal(name=_snake_case(goal), function=goal)
 
@@ -219,8 +219,8 @@ NONE = Extensions()
 
 # Loading
 
-# What was loaded: from a file by its path and the SHA-256 of its content, and by the words of
-# `hand_over`.
+# The pieces that were loaded. The key is the path of a file and the SHA-256 of its content, or a
+# word of `hand_over`.
 _loaded: dict[str, Extensions] = {}
 _HANDED = "python:"  # prefix of the words that `hand_over` returns
 
@@ -306,7 +306,8 @@ def collect(pieces: Iterable[object], where: str) -> Extensions:
       where: name of the pieces' source in messages.
 
     Raises:
-      ConfigError: if there is no piece, something else, or a name or number that is invalid.
+      ConfigError: if there is no piece, if something is not a piece, or if a name or a number of a
+        piece is invalid.
     """
     by_kind: dict[str, dict[str, Any]] = {kind: {} for kind in TAKEN}
     for piece in pieces:
@@ -351,7 +352,8 @@ def _check(piece: Piece, where: str) -> None:
 def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
     """Returns the syntax trees of a function or class, and of all that it uses from its file.
 
-    They lack docstrings and the decorator, whose arguments are in settings and layouts already.
+    The trees lack docstrings. They also lack the decorator, because settings and layouts already
+    have its arguments.
     """
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))

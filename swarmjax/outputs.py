@@ -22,7 +22,7 @@ def replacing(path: Path) -> Iterator[Path]:
       OSError: if the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, so that the move stays within one file system and is atomic.
+    # It is in the same folder, so that the move stays within one file system and is atomic.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
@@ -38,8 +38,8 @@ def make_room(key: str, path: Path, folder: Path | None = None) -> None:
 
     Args:
       key: the key that names the output, for the message.
-      path: the file; or the folder, if there are several files.
-      folder: the folder of the files; None: that of the file.
+      path: the file, or the folder if the output has several files.
+      folder: the folder of several files. None for a single file, whose folder is then made.
 
     Raises:
       ConfigError: if nothing can be written there.
@@ -58,9 +58,9 @@ def unwritable(key: str, path: Path, reason: OSError | str) -> ConfigError:
     """Makes the error for an output that cannot be written.
 
     Args:
-      key: the key that names it.
+      key: the key that names the output.
       path: the file or folder.
-      reason: why.
+      reason: why it cannot be written.
     """
     if isinstance(reason, OSError):
         reason = reason.strerror or str(reason)

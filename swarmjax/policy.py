@@ -12,10 +12,10 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 FORMAT = 5
-MAX_BYTES = 2**30  # limit for all arrays; with two layers of 64 they take 20 kB
-_MAX_LIST = 2**16  # bytes of the list of members; a name takes a hundred
-MAX_LETTERS = 2**20  # characters of `meta`, four bytes each
-MAX_ENTRIES = 2**16  # entries of `meta`, each a hundred bytes or more
+MAX_BYTES = 2**30  # limit for all arrays together; two layers of 64 take 20 kB
+_MAX_LIST = 2**16  # limit for the archive's list of members, bytes; a member takes a hundred
+MAX_LETTERS = 2**20  # limit for the characters of `meta`, which take four bytes each
+MAX_ENTRIES = 2**16  # limit for the entries of `meta`, which take a hundred bytes or more each
 MEMORY = ("input/kernel", "input/bias", "recurrent/kernel", "recurrent/bias")
 
 
@@ -24,20 +24,21 @@ class PolicyError(ValueError):
 
 
 class Policy(NamedTuple):
-    """A trained policy. L is 1 if all robots share one learner; otherwise robot i is learner i."""
+    """A trained policy. L is 1 if all robots share one learner; otherwise robot i has learner i."""
 
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernel [L, in, out] and bias [L, out]
-    log_std: np.ndarray  # [L, U], logarithm of the deviation of the action
+    log_std: np.ndarray  # [L, U], logarithm of the standard deviation of the action
     mean: np.ndarray  # [L, O], mean of the observations
-    std: np.ndarray  # [L, O], their deviation
+    std: np.ndarray  # [L, O], standard deviation of the observations
     is_shared: bool
     encoding: Any  # "metric" or "webots"
-    max_speed: float  # m/s; commands begin at 0
-    max_turn_rate: float  # rad/s, to either side
+    max_speed: float  # m/s; the lowest speed is 0
+    max_turn_rate: float  # rad/s, to the left and to the right
     meta: dict[str, Any]
     digest: str  # SHA-256 of the rest of the file, in hexadecimal
-    network: Any = None  # with `meta["network"]`: normalised [..., R, O] to features
-    # with `meta["memory"]`: input weights [L, F, 3 H] and bias [L, 3 H], recurrent weights and bias
+    network: Any = None  # only with `meta["network"]`: turns normalised [..., R, O] into features
+    # only with `meta["memory"]`: input weights [L, F, 3 H] and their bias [L, 3 H], then recurrent
+    # weights and their bias
     memory: tuple[np.ndarray, ...] | None = None
 
     @property
@@ -68,7 +69,7 @@ def _one_sentence(path: str | Path | IO[bytes]) -> Iterator[None]:
 
 
 def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]:
-    """Returns a file's arrays, the JSON text of its `meta`, and its digest, which is right."""
+    """Returns a file's arrays, the JSON text of its `meta`, and its digest. Checks the digest."""
     with _one_sentence(path):
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
             raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
@@ -87,7 +88,7 @@ def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]
 def assemble(
     arrays: dict[str, np.ndarray], meta: dict[str, Any], said: str, network: Any = None
 ) -> Policy:
-    """Returns the policy of a file's arrays, `meta`, digest and extension's network."""
+    """Makes a policy from the arrays, `meta` and digest of a file, and an extension's network."""
 
     def layer(name: str) -> tuple[np.ndarray, np.ndarray]:
         return arrays[f"actor/{name}/kernel"], arrays[f"actor/{name}/bias"]
@@ -110,7 +111,7 @@ def assemble(
 
 
 def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
-    """Reads the arrays of an archive; refuses one that unpacks to more bytes than it has."""
+    """Reads the arrays of an archive. Refuses a file that unpacks to more bytes than it has."""
     file.seek(max(0, file.seek(0, 2) - 42))
     end = file.read()
     if end[-22:-18] != b"PK\5\6":
@@ -128,7 +129,7 @@ def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
 
 
 def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """Reads a member, and checks that its size matches its header."""
+    """Reads the array in a member, and checks that the member's size matches the array's header."""
     with archive.open(member) as file:
         try:
             version = np.lib.format.read_magic(file)
@@ -159,15 +160,15 @@ def digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarray:
-    """Draws the action of each robot; without `normal` it is the most likely one.
+    """Samples the action of each robot. Without `normal`, returns the most likely action.
 
     Args:
-      policy: Has no memory. It has one learner for all robots, or at least R learners.
+      policy: A policy without memory, with one learner for all robots or at least R learners.
       observation: [..., R, O] as `meta["observation"]` says: (quantity - offset) / scale.
-      normal: [..., R, U] standard normal, drawn afresh at each control step.
+      normal: [..., R, U] standard normal numbers, drawn afresh at each control step.
 
     Returns:
-      [..., R, U] float32. -1..1 spans the commands, but actions may lie beyond it.
+      [..., R, U] float32. -1..1 spans the range of commands, but actions may lie beyond it.
     """
     if policy.carried:
         raise PolicyError("the policy has a memory: call `begin` once an episode, then `step`.")
@@ -175,20 +176,20 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
 
 
 def begin(policy: Policy, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Returns the memory [*shape, H] of robots whose episode begins; None if there is none."""
+    """Returns the memory [*shape, H] for the start of an episode; None if the policy has none."""
     return np.zeros((*shape, policy.carried), "f4") if policy.carried else None
 
 
 def step(
     policy: Policy, memory: Any, observation: Any, normal: Any = 0.0, xp: Any = np
 ) -> tuple[Any, Any]:
-    """Draws actions as `act` does; returns the memory after this step, and the actions.
+    """Samples actions as `act` does; returns the memory after this step, and the actions.
 
     Args:
-      policy: As in `act`, with or without a memory.
-      memory: [..., R, H] from `begin` or from the step before.
+      policy: As in `act`, but with or without a memory.
+      memory: [..., R, H] from `begin` or from the previous call.
       observation, normal: As in `act`.
-      xp: `numpy`, or `jax.numpy` for a policy and observations of JAX.
+      xp: `numpy`, or `jax.numpy` if the policy and the observations have JAX arrays.
     """
     _check(policy, memory, observation)
     mine, limit = slice(observation.shape[-2]), policy.meta["observation"]["limit"]
@@ -227,7 +228,10 @@ def _check(policy: Policy, memory: Any, observation: Any) -> None:
 
 
 def _remember(parts: list[Any], memory: Any, features: Any, xp: Any) -> Any:
-    """Updates the memory with a gated recurrent unit (GRU) whose reset gate follows the product."""
+    """Updates the memory with a gated recurrent unit (GRU).
+
+    Its reset gate multiplies the product of memory and recurrent weights, not the memory itself.
+    """
 
     def logistic(x: Any) -> Any:
         return 0.5 + 0.5 * xp.tanh(0.5 * x)  # 1 / (1 + exp(-x)), without overflow

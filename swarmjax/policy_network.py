@@ -1,6 +1,6 @@
-"""The network of an extension in a policy: code from a user's file, weights from the policy.
+"""A policy's network whose code is in an extension file; its weights are in the policy file.
 
-It imports JAX when it is first called, so that other policies run without JAX.
+The network imports JAX when it is first called, so that other policies run without JAX.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,9 +13,10 @@ from swarmjax import extension
 
 
 class PolicyNetwork:
-    """The part before a policy's last layer: normalised [..., R, O] to features [..., R, F].
+    """The part of a policy that turns normalised observations into the inputs of its last layers.
 
-    It can be sent to another process, which then loads the extension again.
+    It takes [..., R, O] and returns features [..., R, F]. It can be sent to another process, which
+    then loads the extension again.
     """
 
     def __init__(self, source: str, name: str, arrays: Mapping[str, np.ndarray]) -> None:
@@ -24,7 +25,7 @@ class PolicyNetwork:
         Args:
           source: value of the key `extensions`.
           name: name of the network.
-          arrays: [L, ...] its parameters, by their paths.
+          arrays: the network's parameters [L, ...], by their paths in the Flax module.
         """
         self._source, self._name, self._arrays = source, name, dict(arrays)
         self._apply: Callable[[np.ndarray], Any] | None = None
@@ -65,11 +66,12 @@ class PolicyNetwork:
 
 
 def features(module: Any, params: Any, x: Any) -> Any:
-    """Applies a network to arenas side by side, with JAX.
+    """Applies a network to several arenas at once, with JAX.
 
     Args:
       module: Flax module.
-      params: [L, ...] its parameters, of one learner for all robots or of one for each robot.
+      params: [L, ...] the module's parameters. L is 1 if all robots share one learner; otherwise
+        robot i uses learner i.
       x: [B, R, O] normalised observations.
 
     Returns:

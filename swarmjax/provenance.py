@@ -1,4 +1,4 @@
-"""Describes where a result comes from: versions, commit and device. Only the device needs JAX."""
+"""Describes where a result comes from: versions, commit and device. Only `device` needs JAX."""
 
 import importlib.metadata
 import os
@@ -35,7 +35,7 @@ def commit() -> str | None:
     if given:
         return given
     tree = str(Path(__file__).resolve().parent)
-    # Without tags, it describes the commit by its hash.
+    # With all tags excluded, git describes the commit by its hash.
     command = ["git", "-C", tree, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         found = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -45,7 +45,7 @@ def commit() -> str | None:
 
 
 def device() -> str:
-    """Returns the number and name of the accelerators, or the processor and its cores."""
+    """Returns the number and name of the accelerators, or the processor and its number of cores."""
     import jax
 
     found = jax.devices()[0]

@@ -1,11 +1,11 @@
-"""Spreads arenas over devices: each device's share, and how the devices agree.
+"""Spreads arenas over devices, and combines the numbers of all devices.
 
 The program runs once on each device of a mesh (`jax.shard_map`), with the arenas of that device.
-Learning, decisions and reports use all arenas: their numbers are summed over the mesh, so that all
-devices get the same result.
+Learning, decisions and reports use all arenas: the numbers of the devices are summed over the mesh,
+so that all devices get the same result.
 
 Random numbers come in streams. Each arena belongs to one stream, whatever the number of devices. So
-a run with four streams draws the same numbers on one, two or four devices.
+a run with four streams draws the same random numbers on one, two or four devices.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ class Shards:
     Attributes:
       devices: D, the number of devices that share the arenas. With 1 there is no mesh.
       streams: S, the number of random streams, a multiple of D. Stream i serves A / S of
-        the A arenas; the first of them is arena i A / S.
+        the A arenas; its first arena is arena i * A / S.
     """
 
     devices: int = 1

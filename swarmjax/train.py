@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.load_settings import load_run
 
         settings = load_run(arguments)
-        if not settings.run.distributed:  # whose processes first have to find each other
+        if not settings.run.distributed:  # else the processes must first find each other
             threading.Thread(target=_open_device, args=(settings.sim.impl,)).start()
         from swarmjax.run.display import Display
         from swarmjax.run.run import Run
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _open_device(impl: str) -> None:
-    """Opens a GPU for JAX and Warp, which takes 2 s, while the main thread imports its modules."""
+    """Opens a GPU for JAX and Warp while the main thread imports its modules. This takes 2 s."""
     with contextlib.suppress(Exception):  # the run meets the same error, and reports it
         import jax
         import numpy as np
@@ -90,6 +90,7 @@ if __name__ == "__main__":
     from swarmjax.run.settings import TrainConfig
 
     heap.share()
-    # Imports and traces make many objects that stay: looking for garbage takes 0.2 s of a start.
+    # Imports and traces make many objects that stay in memory. Looking for garbage among them takes
+    # 0.2 s of a start.
     gc.set_threshold(100_000)
     sys.exit(command.run("train", main, TrainConfig, (CheckpointError,)))

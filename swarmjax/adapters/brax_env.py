@@ -33,9 +33,9 @@ class SwarmBraxEnv(_base.Env):
     targets reached. `info["is_success"]` is True in the step in which a robot arrives.
 
     A robot that has arrived waits for the others, and nothing must be learned from its transitions
-    while it waits. Brax cannot mask transitions, so these are marked as truncated. Marked
-    transitions stay in Brax's batch, but with zero advantage and zero value error. Absent robots
-    are left out.
+    while it waits. Brax cannot mask transitions, so this class marks these transitions as
+    truncated. Marked transitions stay in Brax's batch, but with zero advantage and zero value
+    error. Absent robots have no Brax environment.
     """
 
     def __init__(self, swarm: Swarm) -> None:

@@ -21,13 +21,15 @@ class SwarmVectorEnv(_vector.VectorEnv):
         observation, info = envs.reset(seed=0)
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
 
-    All robots of an arena end together, when its episode ends. A robot that has arrived stands
-    still until then: its reward is 0, `info["valid"]` is False, and its actions are ignored. It is
-    `terminated` in the last step of the episode. Robots that ran out of time are `truncated`.
+    The sub-environments of an arena all end together, when the arena's episode ends. A robot that
+    has arrived stands still until then: its reward is 0, `info["valid"]` is False, and its actions
+    are ignored. It is `terminated` in the last step of the episode. Robots that ran out of time are
+    `truncated` in that step.
 
     Autoreset is `SAME_STEP`. When an episode ends, the returned observation belongs to the next
     episode, and `info["final_obs"]` holds the last observation of the old one.
-    `info["final_info"]["is_success"]` says which robots arrived. Absent robots are left out.
+    `info["final_info"]["is_success"]` says which robots arrived. Absent robots have no
+    sub-environment.
 
     Attributes:
       arena: [N] the arena of each sub-environment.
@@ -53,8 +55,8 @@ class SwarmVectorEnv(_vector.VectorEnv):
         """Starts an episode in every arena.
 
         Args:
-          seed: seed of all following levels. None continues with the last seed.
-          options: unused; arenas reset themselves.
+          seed: seed of all following levels. None continues the random numbers of the last seed.
+          options: unused, because arenas reset themselves.
 
         Returns:
           [N, O] observations, and an empty info.
@@ -71,7 +73,7 @@ class SwarmVectorEnv(_vector.VectorEnv):
           actions: [N, 2] speed and turn rate, floats, clipped to -1..1.
 
         Returns:
-          [N, O] observations, [N] rewards, terminations and truncations, and the info.
+          Observations [N, O]; rewards, terminations and truncations, each [N]; and the info.
 
         Raises:
           InvalidAction: if the actions have a wrong shape or dtype.

@@ -65,11 +65,12 @@ class SwarmMultiAgentEnv(_base):
           key: unused; the state has its own key.
           state: the state before the step.
           actions: [2] floats by agent, clipped to -1..1.
-          reset_state: the state to start the next episode from; None: a new level.
+          reset_state: the state from which the next episode starts. With None, the next episode
+            has a new level.
 
         Returns:
-          [O] observations by agent, the state, rewards and dones by agent, and the info. If
-          `__all__` is done, the observations belong to the next episode.
+          The observations [O] by agent, the state after the step, the rewards and the dones by
+          agent, and the info. If `__all__` is done, the observations belong to the next episode.
 
         Raises:
           ValueError: if an action is missing, or has a wrong shape or dtype.
@@ -98,7 +99,7 @@ class SwarmMultiAgentEnv(_base):
         return self._by_agent(self.robots.observe(state))
 
     def get_avail_actions(self, state: SwarmState) -> _ByAgent:
-        """Returns for each agent whether its actions [U] are available; False after its arrival."""
+        """Returns for each agent which of its actions [U] are available: none after its arrival."""
         arrived = state.arenas.arrived[0, self.robots.index]
         free = self.robots.swarm.world.goal.drives(arrived)
         return self._by_agent(jnp.repeat(free[:, None], self.robots.action_size, axis=1))

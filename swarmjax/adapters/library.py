@@ -12,7 +12,7 @@ def check(
     Args:
       action: action of one or several robots.
       shape: the expected shape.
-      whose: text at the start of the message, such as the name of an agent.
+      whose: text at the start of the message, such as "robot_0: ".
       error: the type of the error.
     """
     given = tuple(action.shape)

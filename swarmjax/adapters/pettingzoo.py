@@ -22,10 +22,10 @@ class SwarmParallelEnv(_base):
             actions = {agent: env.action_space(agent).sample() for agent in env.agents}
             observations, rewards, terminations, truncations, infos = env.step(actions)
 
-    A robot that arrives is terminated and leaves `agents`. It stays where it is, and the others
-    drive around it. When the time runs out, the remaining agents are truncated. With
-    `task.arrival=hold` all robots leave in the same step. When a robot leaves, its info has
-    `is_success`: whether it arrived. The environment never resets itself.
+    A robot that arrives is terminated and leaves `agents`. It stays where it is, and the other
+    robots drive around it. When the time runs out, the remaining agents are truncated. With
+    `task.arrival=hold`, all robots leave `agents` in the same step. When a robot leaves, its info
+    has `is_success`, which says whether the robot arrived. The environment never resets itself.
 
     Attributes:
       agents: the robots that are still on their way.
@@ -58,7 +58,7 @@ class SwarmParallelEnv(_base):
         """Starts an episode.
 
         Args:
-          seed: seed of all following levels. None continues with the last seed.
+          seed: seed of all following levels. None continues the random numbers of the last seed.
           options: unused.
 
         Returns:
@@ -74,11 +74,12 @@ class SwarmParallelEnv(_base):
         """Makes a control step.
 
         Args:
-          actions: [2] floats by agent, for all in `agents`. Actions of robots that have left are
-            ignored.
+          actions: [2] floats by agent, for every agent in `agents`. Actions of robots that have
+            left are ignored.
 
         Returns:
-          Observations [O], rewards, terminations, truncations and infos of the agents that acted.
+          Observations [O], rewards, terminations, truncations and infos, each by agent, for the
+          agents that acted.
 
         Raises:
           InvalidAction: if an action is missing, names no agent, or has a wrong shape or dtype.

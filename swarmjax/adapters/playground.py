@@ -29,11 +29,11 @@ class SwarmMjxEnv(_playground.MjxEnv):
     [N 2]. The reward is the sum over robots. A robot that has arrived stands still: it earns 0, and
     its actions are ignored. `done` means that all robots have arrived, or that the physics broke.
 
-    Playground's wrapper handles the time limit, as for its own environments. Give the wrapper an
-    `episode_length` no larger than the environment's. With `full_reset=True` the wrapper draws new
-    levels, but Playground 0.2.0 then ignores time-outs and does not bootstrap after them. By
-    default the wrapper repeats the first level of each environment. For a policy that controls one
-    robot, use `swarmjax.adapters.brax_env`.
+    Playground's wrapper handles the time limit, as it does for Playground's own environments. Give
+    the wrapper an `episode_length` no larger than that of this class. With `full_reset=True` the
+    wrapper draws new levels, but Playground 0.2.0 then ignores time-outs and does not bootstrap
+    after them. By default the wrapper repeats the first level of each environment. For a policy
+    that controls one robot, use `swarmjax.adapters.brax_env`.
 
     `state.data` is a `SwarmState`, so `render` is not supported. Use `swarmjax.replay`.
     """
@@ -73,8 +73,9 @@ class SwarmMjxEnv(_playground.MjxEnv):
           action: [N 2] speed and turn rate of each robot, floats, clipped to -1..1.
 
         Returns:
-          The state after the step. `metrics["reached"]` is the share of robots that arrived in this
-          step, and `info["is_success"]` whether the episode ended with all robots at their targets.
+          The state after the step. Its `metrics["reached"]` is the share of robots that arrived in
+          this step. Its `info["is_success"]` says whether the episode ended with all robots at
+          their targets.
 
         Raises:
           ValueError: if the action has a wrong shape or dtype.
@@ -99,15 +100,15 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @property
     def action_size(self) -> int:
-        """Size of the action of all robots: two numbers each."""
+        """Size of the joint action: two numbers per robot."""
         return self.robots.action_size * len(self.robots)
 
     @property
     def mj_model(self) -> Any:
-        """The compiled model."""
+        """The compiled MuJoCo model."""
         return self.robots.swarm.world.physics.host
 
     @functools.cached_property
     def mjx_model(self) -> Any:
-        """The model on the device, made on first use."""
+        """The MuJoCo model on the device. It is made when it is first asked for."""
         return find("mujoco.mjx", "playground").put_model(self.mj_model)

@@ -1,6 +1,6 @@
-"""Lists the robots of all arenas in one row, for libraries with one agent per environment.
+"""Lists the robots of all arenas along one axis, for libraries with one agent per environment.
 
-Axes: A arenas, R robots of an arena, O observation, N present robots in all arenas.
+Axes: A arenas, R robots of an arena, O observation, N present robots of all arenas together.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class RobotStep(NamedTuple):
       reward: [N] the reward; 0 for robots that had already arrived.
       terminated: [N] whether the robot arrived in this step.
       truncated: [N] whether the robot ran out of time.
-      valid: [N] whether the robot was on its way. Learn only from these steps.
+      valid: [N] whether the robot was on its way. Learn only from steps where this is True.
       over: [N] whether the episode of the robot's arena ended.
     """
 
@@ -43,11 +43,11 @@ class RobotStep(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RobotRow:
-    """The robots of a swarm in one row, without absent robots.
+    """The robots of all arenas along one axis, without absent robots.
 
     Attributes:
       swarm: the result of `swarmjax.make_env`.
-      index: [N] indices of the present robots among all A * R places, ascending.
+      index: [N] indices of the present robots among the A * R places for robots, ascending.
     """
 
     swarm: Swarm
@@ -78,7 +78,7 @@ class RobotRow:
           action: [N, U] actions, clipped to -1..1; -1 and 1 are the ends of the range of commands.
 
         Returns:
-          The state after the step, and the outcome.
+          The state after the step, and the outcome for each robot.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
         places = jnp.zeros((arenas * robots, self.action_size)).at[self.index].set(action)
@@ -99,14 +99,14 @@ class RobotRow:
 
 
 def line_up(swarm: Swarm) -> RobotRow:
-    """Lists the robots of a swarm. Arena i plays stage i modulo the number of stages."""
+    """Lists the present robots of a swarm. Arena i plays stage i modulo the number of stages."""
     stage = np.arange(swarm.num_arenas) % len(swarm.stages.robots)
     present = np.arange(swarm.num_robots) < np.asarray(swarm.stages.robots)[stage][:, None]
     return RobotRow(swarm, np.flatnonzero(present))
 
 
 def line_up_arena(swarm: Swarm) -> RobotRow:
-    """Lists the robots of a swarm with one arena.
+    """Lists the present robots of a swarm with one arena.
 
     Raises:
       ValueError: if the swarm has more than one arena.

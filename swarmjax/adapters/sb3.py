@@ -14,17 +14,18 @@ _base: Any = find("stable_baselines3.common.vec_env", "sb3", "VecEnv")
 
 
 class SwarmVecEnv(_base):
-    """A VecEnv with one environment per robot. All share the policy.
+    """A VecEnv with one environment per robot. All robots share one policy.
 
         model = PPO("MlpPolicy", SwarmVecEnv(swarmjax.make_env("s1", arenas=16)))
         model.learn(500_000)
 
     Robots that have arrived are handled as SuperSuit's `black_death` handles them. All robots of an
-    arena are done together, when its episode ends. A robot that has arrived stands still until
-    then: its reward is 0, its actions are ignored, and its steps stay in the batch. In the last
-    step, each info has `terminal_observation`. The info's entry `TimeLimit.truncated` says whether
-    the robot ran out of time, and `is_success` whether it arrived. The returned observation then
-    belongs to the next episode. Absent robots are left out.
+    arena are done together, when the arena's episode ends. A robot that has arrived stands still
+    until then: its reward is 0, its actions are ignored, and its steps stay in the batch. In the
+    last step of the episode, the info of each robot has `terminal_observation`. The info's entry
+    `TimeLimit.truncated` says whether the robot ran out of time, and `is_success` whether it
+    arrived. The observation that this step returns belongs to the next episode. Absent robots have
+    no environment.
 
     Attributes:
       arena: [N] the arena of each environment.
@@ -43,7 +44,7 @@ class SwarmVecEnv(_base):
         super().__init__(len(robots), *spaces(robots))
 
     def reset(self) -> np.ndarray:
-        """Starts an episode in every arena, with the seed given to `seed`, if any.
+        """Starts an episode in every arena. The method `seed` sets the seed of the levels.
 
         Returns:
           [N, O] observations.
@@ -98,13 +99,13 @@ class SwarmVecEnv(_base):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Raises AttributeError, since all environments are one program."""
+        """Raises AttributeError, because one program steps all environments."""
         raise AttributeError(f"{attr_name} cannot be set: the robots are stepped by one program.")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Raises AttributeError, since all environments are one program."""
+        """Raises AttributeError, because one program steps all environments."""
         raise AttributeError(f"{method_name} cannot be called: one program steps the robots.")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Sequence[bool]:

@@ -1,4 +1,4 @@
-"""Steps the robots of a swarm from the host with NumPy arrays, for libraries that use them.
+"""Steps the robots of a swarm from the host with NumPy arrays, for libraries that use NumPy.
 
 All errors have Gymnasium's types, even if PettingZoo or Stable-Baselines3 drives the robots.
 """
@@ -44,7 +44,7 @@ class Session:
         return np.array(self._robots.observe(state))
 
     def begin(self, action: Any) -> RobotStep:
-        """Starts a control step, and does not wait for it.
+        """Starts a control step, and does not wait for its end.
 
         Args:
           action: [N, U] floats, clipped to -1..1.

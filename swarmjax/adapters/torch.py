@@ -18,14 +18,15 @@ class SwarmTorchEnv:
         observation = env.reset(seed=0)  # [N, O]
         came = env.step(policy(observation))  # [N, 2]
 
-    Each robot is a row. All robots may share one policy. A step returns a `RobotStep`: act on
-    `observation`, bootstrap from `last` where `truncated`, and learn where `valid`. A robot is
-    `terminated` in the step in which it arrives. After that it is not `valid` and its reward is 0,
-    until its arena is `over` and starts the next episode automatically. `is_success` then says
-    which robots had arrived. Absent robots are left out.
+    Each row of a tensor belongs to one robot. All robots may share one policy. A step returns a
+    `RobotStep`: act on `observation`, bootstrap from `last` where `truncated` is True, and learn
+    where `valid` is True. A robot is `terminated` in the step in which it arrives. In the following
+    steps it is not `valid` and its reward is 0, until its arena is `over` and starts the next
+    episode automatically. In the step where the arena is `over`, `is_success` says which robots had
+    arrived. Absent robots have no row.
 
     JAX assumes that its arrays never change. So do not write into a tensor that this class has
-    returned. Do not write into an action either, until the step that it was given to has returned.
+    returned. Do not write into an action before the step that takes it has returned.
     Actions must lie on the device on which JAX computes. Gradients of actions are ignored.
 
     Attributes:

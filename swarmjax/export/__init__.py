@@ -1,5 +1,5 @@
 """Exports policies in other forms: NumPy, ONNX, C99 and a Webots controller.
 
-Imports policy files, sensor responses of `sim`, and `run` to read a run's checkpoint. Start with
-`__main__.main`.
+This package imports `policy_file`, the sensor responses of `sim`, and `run`, which reads a run's
+checkpoint. Read `__main__.main` first.
 """

@@ -1,6 +1,6 @@
 """`python -m swarmjax.export run=DIR`: exports a checkpoint as `policy.npz`, ONNX, C or for Webots.
 
-A run with several seeds gives `policy-seed0.npz` and so on; `seed` exports only one of them.
+A run with several seeds gives `policy-seed0.npz` and so on; the key `seed` exports only one seed.
 
 Examples:
   # write the policy of the newest checkpoint again
@@ -37,7 +37,7 @@ from swarmjax.run.policy_export import POLICY, seed_path, write_policy
 from swarmjax.run.settings import TrainConfig
 from swarmjax.sim import response
 
-# Default name of each format if `out` is not given.
+# Name of the export in each format if `out` is not given.
 _NAMES = {"npz": POLICY, "onnx": "policy.onnx", "c": "policy_c", "webots": "swarmjax_epuck"}
 
 
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
-    """Lists the seeds to export and their paths."""
+    """Returns the path of the export for each seed to export."""
     every, seed = trained.numbers, settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."
@@ -79,7 +79,7 @@ def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
 
 
 def _target(settings: ExportConfig, folder: Path) -> Path:
-    """Returns the path of a single policy, whether or not it already exists."""
+    """Returns the path to write if one policy is exported. The path may already exist."""
     out = Path(settings.out) if settings.out else folder / _default(settings)
     if out.name in ("", ".."):
         raise ConfigError(
@@ -92,7 +92,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
 
 
 def _default(settings: ExportConfig) -> str:
-    """Returns the default name of the export; with `step` it does not replace the final policy."""
+    """Returns the default name of the export. With `step`, it is not that of the final policy."""
     name = Path(_NAMES[settings.format])
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
@@ -103,7 +103,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     """Writes a policy file in another form.
 
     Args:
-      settings: the form.
+      settings: the export's settings, which give the form.
       source: the policy file.
       out: the file or folder to write.
 
@@ -115,7 +115,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
     if settings.format == "npz":
         outputs.write({out: content})
         return
-    # Refuses numbers that the archive's reader leaves unchecked.
+    # Refuses numbers that `policy_file` does not check.
     trained_settings.trained(meta, str(source))
     _check_form(meta, settings.format)
     trained = policy_file.read(source)
@@ -161,7 +161,7 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
 
 
 def _check_range(meta: Mapping[str, Any]) -> None:
-    """Checks that the policy's infrared reaches no further than the sensors measure distances."""
+    """Checks that the policy needs no distances beyond the reach of Webots' infrared sensors."""
     reach, farthest = meta["sensors"]["range"], response.REACH["webots"]
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(

@@ -33,7 +33,7 @@ def render(trained: Policy) -> dict[str, bytes]:
     """
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).resolve().parent / "templates" / "c"),
-        autoescape=False,  # C is no HTML; a policy's names have plain letters
+        autoescape=False,  # the files are no HTML, and a policy's names have plain letters only
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -60,7 +60,7 @@ def render(trained: Policy) -> dict[str, bytes]:
 
 
 def _arrays(trained: Policy) -> dict[str, np.ndarray]:
-    """Lists the arrays [L, ...]; in a transposed kernel an output's weights are adjacent."""
+    """Lists the arrays [L, ...]. Kernels are transposed: the weights of an output are adjacent."""
     layers = {f"KERNEL_{i} BIAS_{i}": layer for i, layer in enumerate(trained.layers)}
     if trained.memory is not None:
         (seen, seen_bias, recalled, recalled_bias) = trained.memory
@@ -74,7 +74,10 @@ def _arrays(trained: Policy) -> dict[str, np.ndarray]:
 
 
 def _cases(trained: Policy) -> dict[str, np.ndarray]:
-    """Makes the self-test's cases, half of them beyond the clip, and NumPy's results for them."""
+    """Makes the self-test's cases, and NumPy's results for them.
+
+    In half of the cases, observations may exceed the limit to which the policy clips them.
+    """
     draw = np.random.default_rng(0)
     shape = (CASES, *trained.mean.shape)
     reach = np.where(np.arange(CASES) % 2, 1.5 * trained.meta["observation"]["limit"], 3.0)
@@ -88,7 +91,7 @@ def _cases(trained: Policy) -> dict[str, np.ndarray]:
 
 
 def _play(trained: Policy, observation: np.ndarray) -> np.ndarray:
-    """Computes the most likely actions for successive observations; clears memory halfway."""
+    """Computes the most likely actions for successive observations. Clears the memory halfway."""
     actions, memory = [], None
     for i, seen in enumerate(observation):
         if i in (0, CASES // 2):
@@ -112,6 +115,6 @@ def number(value: float) -> str:
       value: the number, rounded to float32.
 
     Returns:
-      The fewest digits that distinguish it from its neighbours.
+      A text with the fewest digits that distinguish the number from other float32 numbers.
     """
     return f"{np.format_float_scientific(np.float32(value), trim='0')}f"

@@ -16,17 +16,17 @@ class ExportConfig(Section):
     run: str | None = setting(None, "run directory; give either run or policy")
     policy: str | None = setting(None, "path of a policy.npz; give either run or policy")
     format: Literal["npz", "onnx", "c", "webots"] = setting(
-        "npz", "form of the export: an npz or onnx file, or a folder"
+        "npz", "form of the export; npz and onnx are one file, c and webots a folder"
     )
     step: int | None = setting(
-        None, "update of the run's checkpoint; null: the newest valid", 0, MAX_COUNT
+        None, "update of the run's checkpoint; null: the newest valid checkpoint", 0, MAX_COUNT
     )
     seed: int | None = setting(None, "seed of the run's policy; null: all seeds", 0, MAX_COUNT)
     out: str | None = setting(
-        None, "file or folder to write; null: in run or beside policy, named by format and step"
+        None, "file or folder to write; null: named by format and step, in run or beside policy"
     )
     extensions: str | None = setting(
-        None, "Python file with the pieces that the policy needs; it is executed"
+        None, "Python file with the pieces that the policy needs; this file is executed"
     )
 
     def _check(self) -> None:

@@ -6,7 +6,7 @@ from swarmjax.policy import Policy
 def entries(policy: Policy) -> list[tuple[str, str, float, float]]:
     """Lists name, unit, offset and scale of the [O] entries of a policy's observation.
 
-    An entry is (quantity - offset) / scale, with the other three in the quantity's unit.
+    An entry is (quantity - offset) / scale. Quantity, offset and scale are in the listed unit.
 
     Args:
       policy: the policy.

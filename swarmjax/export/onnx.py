@@ -1,6 +1,7 @@
 """Writes a policy as an ONNX graph, from the observation to the action and the command.
 
-Needs the package `onnx`, an extra. The model's metadata describe the layout of the observation.
+This module needs the package `onnx`, which the extra `onnx` installs. The model's metadata describe
+the layout of the observation.
 """
 
 import json
@@ -14,7 +15,8 @@ from swarmjax.policy import Policy
 if TYPE_CHECKING:
     from onnx import NodeProto, TensorProto
 
-# The operations here have not changed since this version of 2021, so old runtimes read the file.
+# The operations used here have not changed since this version of 2021, so old runtimes can read the
+# file.
 OPSET = 17
 IR_VERSION = 8
 
@@ -53,10 +55,10 @@ def render(policy: Policy) -> bytes:
     Returns:
       The bytes of an ONNX file. Its input `observation` is [B, O] for a shared policy, else
       [B, R, O], where R is the number of learners; `meta["observation"]` of the policy describes
-      the entries. Its outputs are `action` ([..., U], as `policy.act` without `normal`) and
-      `command` (as `policy.command`: m/s and rad/s). A policy with memory has a second input
-      `memory` and a third output `memory_after`: [..., H]. `memory` is zero at the start of an
-      episode.
+      the entries. Its outputs are `action` ([..., U], as `policy.act` returns it without `normal`)
+      and `command` ([..., U], as `policy.command` returns it, in m/s and rad/s). A policy with
+      memory has a second input `memory` and a third output `memory_after`, both [..., H]. `memory`
+      must be zero at the start of an episode.
 
     Raises:
       ConfigError: if the package `onnx` is not installed.
@@ -112,7 +114,7 @@ def _learner(graph: _Graph, policy: Policy, i: int) -> tuple[str, ...]:
     """Adds the networks of learner i; returns its action [B, U] and perhaps its memory [B, H]."""
 
     def mine(name: str) -> str:
-        """Selects the robot's part of an input."""
+        """Selects learner i's part of an input."""
         if policy.is_shared:
             return name
         return graph.add("Gather", name, graph.constant(i, np.int64), axis=1)
@@ -142,7 +144,7 @@ def _remember(graph: _Graph, parts: list[np.ndarray], x: str, memory: str) -> st
         return np.concatenate([update, reset, candidate], axis=-1)
 
     seen, seen_bias, recalled, recalled_bias = map(ordered, parts)
-    first = graph.constant([0], np.int64)  # the axis of time in x, and of direction elsewhere
+    first = graph.constant([0], np.int64)  # axis of time in x, and of directions in other inputs
     after = graph.add(
         "GRU",
         graph.add("Unsqueeze", x, first),

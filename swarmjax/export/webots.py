@@ -24,7 +24,7 @@ def render(trained: Policy, content: bytes, name: str) -> dict[str, bytes]:
     Args:
       trained: the policy.
       content: content of the policy file.
-      name: name of the controller and of its folder; Webots needs them to be equal.
+      name: name of the controller and of its folder. Webots requires that both have the same name.
 
     Returns:
       The controller, `policy.py`, `policy.npz`, `sensors.json` and `README.md`.
@@ -43,7 +43,7 @@ def sensors() -> dict[str, list[float]]:
     """Describes how to convert the counts of simulated infrared sensors to distances.
 
     Returns:
-      The points of Webots' table as `distance` (m) and `counts`, to be interpolated linearly.
+      The points of Webots' table as `distance` (m) and `counts`. Interpolate linearly between them.
     """
     counts = np.array([row[1] for row in epuck.INFRARED_TABLE])
     distance = response.distance("webots", counts, np)

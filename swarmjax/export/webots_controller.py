@@ -1,12 +1,13 @@
 """Drives a Webots e-puck to its target with a trained policy. Needs only NumPy.
 
-In every control step it reads infrared, GPS and compass, and sets the speeds of the wheels. It
-needs `policy.npz` and `sensors.json` in the same folder. The second file gives the meaning of the
-sensors' counts.
+In every control step the controller reads infrared, GPS and compass, and sets the speeds of the
+wheels. It needs `policy.npz` and `sensors.json` in the same folder. `sensors.json` says which
+distances the counts of the infrared sensors stand for.
 
-The target is `target=x,y` (m) in the robot's controllerArgs, or in its customData, where it may
-change. A policy that is not shared also needs `robot=i`, the robot's number from 0. The robot draws
-its actions from the policy. With `action=mean` it takes the most likely action.
+Give the target as `target=x,y` (m) in the robot's controllerArgs, or in its customData, which you
+may change while the robot drives. A policy that is not shared also needs `robot=i`, the robot's
+number from 0. The robot samples its actions from the policy. With `action=mean` it takes the most
+likely action.
 """
 
 import importlib
@@ -29,7 +30,7 @@ MOTORS = ("left wheel motor", "right wheel motor")
 
 
 class Orders(NamedTuple):
-    """A robot's target, its number, and whether it draws its actions."""
+    """A robot's target, the robot's number from 0, and whether its actions are sampled."""
 
     target: tuple[float, float] | None = None
     robot: int = 0
@@ -46,7 +47,7 @@ def parse(words: Iterable[str]) -> Orders:
       The orders.
 
     Raises:
-      ValueError: if a word is none of these.
+      ValueError: if a word is anything else.
     """
     orders = Orders()
     for word in words:
@@ -133,12 +134,12 @@ def wheel_speeds(
       trained: the policy.
       observation: [O] the observation.
       robot: the robot's number, from 0.
-      normal: [U] standard normal numbers to draw the action; 0 gives the most likely one.
+      normal: [U] standard normal numbers that sample the action; 0 gives the most likely action.
       memory: memory that `policy.begin` or the previous call returned.
 
     Returns:
-      [2] speeds of the left and the right wheel, rad/s, each within its own limit, and the memory
-      afterwards.
+      [2] speeds of the left and the right wheel, rad/s, each limited on its own; and the memory for
+      the next call.
     """
     # The rows of robots with lower numbers only ensure that this robot gets its own network.
     seen = np.broadcast_to(observation, (1 if trained.is_shared else robot + 1, observation.size))
@@ -200,7 +201,8 @@ def control_period(trained: Policy, basic_step: float) -> int:
       The control step that the policy was trained with, ms.
 
     Raises:
-      ValueError: if the control step is not a whole number of ms or a multiple of `basic_step`.
+      ValueError: if the control step is not a whole number of ms, or not a multiple of
+        `basic_step`.
     """
     period = 1000 * trained.meta["task"]["control_step"]
     if abs(round(period) - period) > 1e-6 * period:
@@ -258,7 +260,7 @@ def drive(robot: Any, folder: Path, words: Sequence[str]) -> None:
 
 def main() -> int:
     """Runs the controller in Webots; returns its exit code."""
-    # Only a controller started by Webots can import its package `controller`.
+    # Webots' package `controller` can be imported only in a controller that Webots has started.
     robot = importlib.import_module("controller").Robot()
     try:
         drive(robot, Path(__file__).resolve().parent, sys.argv[1:])

@@ -1,8 +1,8 @@
 """Fills templates of pages, and writes pages.
 
 A template `package/name` is the file `swarmjax/package/templates/name`. Jinja2 escapes every value.
-Data from a run are always values, never templates. Each page has a content security policy that
-lets it load and run only what its own package put into it.
+Data from a run are always values, never templates. The content security policy of each page lets
+the page load and run only what its own package put into it.
 """
 
 import base64
@@ -77,19 +77,19 @@ def render(
 
 
 def _hash_source(text: str) -> str:
-    """Writes the hash of a style or a script for the policy (W3C, CSP Level 3, 2.3.1)."""
+    """Writes the hash of a style or a script as a source (W3C, CSP Level 3, 2.3.1)."""
     return f"'sha256-{_base64(hashlib.sha256(text.encode()).digest())}'"
 
 
 def write(out: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Writes files into a directory and creates the directory.
+    """Writes files into a directory, which it creates if necessary.
 
     Args:
       out: the directory.
       files: contents by name; a name may contain subfolders.
 
     Returns:
-      The paths of the files, in order.
+      The paths of the files, in the order of `files`.
 
     Raises:
       ConfigError: if a file cannot be written.

@@ -17,8 +17,8 @@ _COLOURS = 128
 def png(figure: Figure, dots: int = DOTS) -> bytes:
     """Makes a PNG file of a figure: the same file in any Matplotlib version.
 
-    A palette makes it a quarter as large, which counts in a report with a curve for each of fifty
-    seeds.
+    A palette makes the file a quarter as large. This matters in a report with a curve for each of
+    fifty seeds.
     """
     drawn, content = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=dots)
@@ -27,19 +27,19 @@ def png(figure: Figure, dots: int = DOTS) -> bytes:
 
 
 def dress(panel: Axes, title: str, size: float = 10.0) -> None:
-    """Gives a panel its title, in points, and a faint grid."""
+    """Gives a panel a faint grid, and a title of `size` points."""
     panel.set_title(title, loc="left", fontsize=size, pad=3)
     panel.grid(visible=True, alpha=0.25)
     panel.tick_params(labelsize=min(size, 9.0))
 
 
 def percent() -> PercentFormatter:
-    """Formats shares of 0 to 1 in percent."""
+    """Makes a formatter that writes shares of 0 to 1 in percent."""
     return PercentFormatter(1.0, symbol=" %")
 
 
 def thousands(least: float = 0.0) -> FuncFormatter:
-    """Formats counts as 500, 1.5k and 1M.
+    """Makes a formatter that writes counts as 500, 1.5k and 1M.
 
     Args:
       least: smaller counts are written in full.

@@ -1,7 +1,7 @@
-"""Policy files (docs/policy-format.md). Start with `read`.
+"""Reads, checks and writes policy files (docs/policy-format.md). Read the function `read` first.
 
 `archive` reads and writes the files, and `fields` checks what they hold. This package imports
-`config`, `policy.py`, `policy_network.py`, `extension.py` and `outputs.py`, and no JAX.
+`config`, `policy.py`, `policy_network.py`, `extension.py` and `outputs.py`, but not JAX.
 """
 
 from swarmjax.policy_file.archive import read, read_meta, write

@@ -1,6 +1,6 @@
-"""Reads and writes policy files (docs/policy-format.md). No JAX.
+"""Reads and writes policy files (docs/policy-format.md). Needs no JAX.
 
-`policy.py` reads the archive and checks its digest; `fields` checks what it holds.
+`policy.py` reads the archive and checks the digest; `fields` checks what the archive holds.
 """
 
 import json
@@ -24,15 +24,14 @@ def read(path: str | Path, extensions: str | None = None) -> Policy:
 
     Args:
       path: Path of the file.
-      extensions: Value of the key with that name, for a policy whose network is an extension's
-        code.
+      extensions: Value of the key `extensions`, for a policy whose network is code of an extension.
 
     Returns:
       The policy.
 
     Raises:
       PolicyError: The file is missing, damaged, of another format or inconsistent.
-      ConfigError: Its network is not in `extensions`.
+      ConfigError: The policy's network is not in `extensions`.
     """
     arrays, meta, digest = _read(Path(path))
     network = None
@@ -51,7 +50,7 @@ def read_meta(path: str | Path) -> dict[str, Any]:
       path: Path of the file.
 
     Returns:
-      Its `meta`.
+      The file's `meta`.
 
     Raises:
       PolicyError: The file is missing, damaged, of another format or inconsistent.
@@ -68,7 +67,7 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
       meta: All keys of the format's `meta` except `format`, which is added.
 
     Raises:
-      PolicyError: `read` would refuse the file, or it cannot be written.
+      PolicyError: `read` would refuse the file, or the file cannot be written.
     """
     path, full = Path(path), {**meta, "format": FORMAT}
     _check(path, arrays, full)

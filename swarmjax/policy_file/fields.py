@@ -1,4 +1,4 @@
-"""Checks what a policy file holds: the fields of `meta`, and the arrays. No JAX."""
+"""Checks what a policy file holds: the fields of `meta`, and the arrays. Needs no JAX."""
 
 import json
 import re
@@ -17,7 +17,8 @@ _LAST_READER = "d8b3078"  # the last commit that reads formats 2 to 4
 _DTYPE = np.dtype("<f4")
 _MOST = float(np.finfo(np.float32).max)  # limit for numbers in `meta`, since they become float32
 _SMALLEST = float(np.finfo(np.float32).tiny)
-_MOST_LIMIT = 1e6  # limit in standard deviations; above it, float32 sums may overflow
+# The highest `observation.limit`, in standard deviations. Above it, float32 sums may overflow.
+_MOST_LIMIT = 1e6
 _OWN_ARRAY = re.compile(NETWORK + r"(\w{1,64}/){0,8}\w{1,64}", re.ASCII)
 _NAME = re.compile(r"[a-zA-Z][\w.-]{0,63}", re.ASCII)
 _UNIT = re.compile(r"(?!.*(?:\*/|/\*))[a-zA-Z0-9/^*. -]{1,16}")  # cannot open or close a comment
@@ -35,7 +36,7 @@ def _is_whole(value: object) -> TypeGuard[int]:
 
 
 def _is_number(value: object) -> TypeGuard[float]:
-    # The comparison works for integers beyond a float's range too.
+    # The comparison also works for integers that no float can hold.
     return (_is_whole(value) or isinstance(value, float)) and -_MOST <= value <= _MOST
 
 
@@ -58,7 +59,7 @@ def _whole(least: int, most: int | None = None) -> _Rule:
 
 
 def _words(kind: str, form: re.Pattern[str]) -> _Rule:
-    """A list of words that are safe in a comment of any language."""
+    """Makes the rule for a list of words that are safe in a comment of any language."""
     return _Rule(
         f"a list of {kind} in plain letters",
         lambda value: _are(value, lambda word: _is_word(word, form)),
@@ -82,7 +83,7 @@ _POSITIVE = _Rule(
     "a number above 0", lambda value: _is_number(value) and bool(np.float32(value) > 0)
 )
 _NAMED = _Rule("a name", lambda value: _is_word(value, _NAME))
-_FIELDS = {  # of `meta`; an object comes before what it holds
+_FIELDS = {  # of `meta`; an object comes before the fields that it holds
     "policy": _one_of("shared", "independent"),
     "learners": _whole(1),
     "activation": _one_of("tanh", "relu", "swish"),
@@ -130,7 +131,7 @@ _FIELDS = {  # of `meta`; an object comes before what it holds
     "task.target_radius": _POSITIVE,
     "task.arrival": _one_of("latch", "hold"),
 }
-_OPTIONAL = {  # fields that may be missing, with what they hold
+_OPTIONAL = {  # fields of `meta` that may be missing, each with the rules that it must meet
     "network": {"network": _NAMED},
     "memory": {
         "memory": _OBJECT,
@@ -156,7 +157,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
       meta: All of the file's `meta`.
 
     Raises:
-      PolicyError: One sentence that names the field.
+      PolicyError: The contents are refused, in one sentence that names the field.
     """
     if meta.get("format") != FORMAT:
         raise PolicyError(
@@ -196,7 +197,7 @@ def _check_fields(meta: Mapping[str, Any], rules: Mapping[str, _Rule]) -> None:
 
 
 def _check_observation(meta: Mapping[str, Any]) -> None:
-    """Checks that the lists of the layout fit each other."""
+    """Checks that the lists in `meta.observation` have the same length and differing names."""
     layout, names = meta["observation"], meta["observation"]["names"]
     if not names or len(set(names)) < len(names):
         raise PolicyError(
@@ -226,7 +227,7 @@ def _check_action(layout: Mapping[str, Any]) -> None:
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-    """Checks names, then types, shapes and values."""
+    """Checks the names of the arrays first, then types, shapes and values."""
     shapes = _shapes(arrays, meta)
     for name in shapes:
         if name not in arrays:
@@ -255,7 +256,7 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def _hidden_layers(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> int:
-    """Counts the hidden layers; at least one, unless the network is an extension's code."""
+    """Counts the hidden layers. The result is at least 1, unless an extension has the network."""
     layers = {match[0] for name in arrays if (match := re.match(r"actor/hidden_\d+/", name))}
     return len(layers) if "network" in meta else max(1, len(layers))
 
@@ -263,7 +264,7 @@ def _hidden_layers(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) ->
 def _shapes(
     arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]
 ) -> dict[str, tuple[int, ...]]:
-    """Returns the expected shape of each array; the width of a hidden layer is that of its bias."""
+    """Returns the expected shape of each array. The bias of a hidden layer gives its width."""
     learners, width = meta["learners"], len(meta["observation"]["names"])
     shapes: dict[str, tuple[int, ...]] = {
         f"normalizer/{part}": (learners, width) for part in ("mean", "std")
@@ -299,7 +300,7 @@ def short_json(value: object) -> str:
     """Formats a value as JSON of 80 characters at most, for an error message.
 
     Args:
-      value: Anything; what JSON lacks is shown as text.
+      value: Anything; a value of a type that JSON lacks is shown as text.
 
     Returns:
       The text.

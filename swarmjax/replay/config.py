@@ -20,7 +20,7 @@ class ReplayConfig(JudgeConfig):
     )
     worst: int | None = setting(None, "replay this many of the worst episodes", 1, 100)
     out: str = setting("replay.html", "HTML file of the replay")
-    video: str | None = setting(None, "MP4 file of the scene in 3-D")
+    video: str | None = setting(None, "MP4 file of the scene in 3-D; null: no video")
 
     def _check(self) -> None:
         super()._check()
@@ -42,16 +42,16 @@ class ReplayConfig(JudgeConfig):
 
     @property
     def policies(self) -> tuple[str, ...]:
-        """The policies' paths."""
+        """Paths of the policy files."""
         return tuple(self.policy.split(","))
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """The numbers of the named levels."""
+        """The numbers of the levels that `level` lists; 0 if it is None."""
         return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
 
     @property
     def evaluation(self) -> EvaluateConfig:
-        """The evaluation to which the episodes belong."""
+        """Settings of the evaluation to which the replayed episodes belong."""
         shared = {item.name: getattr(self, item.name) for item in fields(JudgeConfig)}
         return EvaluateConfig(policy=self.policy, **shared)

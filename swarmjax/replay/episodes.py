@@ -21,7 +21,7 @@ from swarmjax.task.config import TaskConfig
 
 
 class Pick(NamedTuple):
-    """An episode to replay: the index of its cell, and its row there."""
+    """An episode to replay: the index of its cell in the suite, and its row in that cell."""
 
     cell: int
     row: int
@@ -34,16 +34,16 @@ def replay(
 
     Args:
       settings: The replay's settings.
-      entrants: The policies that drive.
-      progress: Shows the progress, and whether an evaluation is used.
+      entrants: The policies that drive the robots.
+      progress: Shows the progress, and says whether the results of an earlier evaluation are used.
 
     Returns:
-      The recordings of each level, in the order in which the levels were named, or the worst
-      first.
+      The recordings of each level. They are in the order of the setting `level`; with `worst`, the
+      worst episode comes first.
 
     Raises:
-      PolicyError: If a policy does not fit a level's stage.
-      ConfigError: If there are too few levels, or the physics breaks down.
+      PolicyError: If a policy does not fit the stage of a level.
+      ConfigError: If `worst` exceeds the number of levels, or the physics breaks down.
     """
     if settings.worst is None:
         suite = Suite(None, (cells.draw_stage(settings.evaluation, settings.levels),))
@@ -65,7 +65,10 @@ def replay(
 def _judge(
     settings: ReplayConfig, entrant: Entrant, suite: Suite, count: int, progress: Progress
 ) -> list[Trial]:
-    """Takes a policy's results on all `count` levels from an evaluation, or judges the policy."""
+    """Takes a policy's results on all levels from an earlier evaluation, or evaluates the policy.
+
+    `count` is the number of levels.
+    """
     say = partial(progress.print, markup=False, highlight=False, soft_wrap=True)
     episodes, found = words.count(count, "episode"), judged.find(settings, entrant, suite)
     if found:
@@ -115,11 +118,13 @@ def _record(
 
 
 def outcome(runs: Sequence[Recording], task: TaskConfig) -> str:
-    """Says how an episode ended: `4 of 5 robots arrived, 12.3 s`; `3 and 4 of 5` of two policies.
+    """Says how an episode ended, as in `4 of 5 robots arrived, 12.3 s`.
+
+    With two policies, the text begins like `3 and 4 of 5 robots`.
 
     Args:
-      runs: The level's recordings, one a policy.
-      task: Its control step and `arrival` matter.
+      runs: The level's recordings, one per policy.
+      task: Gives the control step, and what counts as arrival.
     """
     there = " and ".join(str(run.arrived[-1].sum()) for run in runs)
     robots = words.count(runs[0].arrived.shape[1], "robot")

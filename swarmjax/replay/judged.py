@@ -1,4 +1,4 @@
-"""Finds what `evaluate` has judged already, so that a replay need not judge it again."""
+"""Finds results that `evaluate` has stored, so that a replay need not evaluate a policy again."""
 
 import csv
 import json
@@ -14,13 +14,14 @@ from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.trials import Entrant, Trial
 from swarmjax.replay.config import ReplayConfig
 
-RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # what orders episodes
+RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # these order episodes
 
 
 def find(settings: ReplayConfig, entrant: Entrant, suite: Suite) -> tuple[str, list[Trial]] | None:
     """Looks for a policy's results in the files of an evaluation.
 
-    Looks beside the policy and beside the page, and in the folders there.
+    Looks in the folder of the policy file and in the folder of the page, and in their subfolders
+    one level down.
 
     Args:
       settings: The replay's settings.
@@ -29,8 +30,8 @@ def find(settings: ReplayConfig, entrant: Entrant, suite: Suite) -> tuple[str, l
 
     Returns:
       The folder of the files, and trials with the measures `RANKED` alone. None if no file has the
-      same policy, levels, settings and versions of the software; and if there is an extension,
-      whose code may have changed since.
+      same policy, levels, settings and versions of the software. Also None if the settings name an
+      extension, because its code may have changed since the evaluation.
     """
     config = settings.evaluation
     cells = [summary.about_cell(config, cell) for cell in suite.cells]
@@ -47,7 +48,10 @@ def find(settings: ReplayConfig, entrant: Entrant, suite: Suite) -> tuple[str, l
 
 
 def _match(result: Any, wanted: dict[str, Any], digest: str) -> str:
-    """Returns the path under which a result has the policy; raises if it is of anything else."""
+    """Returns the path under which a result lists the policy.
+
+    Raises an error if the result is of another evaluation or of other policies.
+    """
     stored = {key: result[key] for key in wanted}
     stored["cells"] = [{key: cell[key] for key in wanted["cells"][0]} for cell in result["cells"]]
     if stored != wanted:
@@ -57,7 +61,10 @@ def _match(result: Any, wanted: dict[str, Any], digest: str) -> str:
 
 
 def _read(file: Path, path: str, suite: Suite) -> list[Trial]:
-    """Reads a policy's rows; raises unless there is one for each level of the suite, in order."""
+    """Reads a policy's rows.
+
+    Raises an error unless there is one row for each level of the suite, in the suite's order.
+    """
     rows = csv.DictReader(line.decode() for line in reading.read_lines(file))
     mine = [row for row in rows if row["policy"] == path]
     levels = [(cell.name, str(number)) for cell in suite.cells for number in cell.episodes]

@@ -1,4 +1,4 @@
-"""Packs recordings into few bytes: integer quanta, differences in time, deflated.
+"""Packs recordings into few bytes: numbers are rounded to quanta, and differences are deflated.
 
 The packed data are one zlib stream with three parts. First comes the length of the header (4 bytes,
 little-endian), then the header (JSON), and last the series of all runs, in the order in which the
@@ -6,9 +6,9 @@ header lists them.
 
 A series is a table of integers with one row per frame. Each number is stored as the difference to
 the number above it; the first row is stored as it is. Signed differences are folded: 0, -1, 1, -2,
-2, ... become 0, 1, 2, 3, 4, ... The numbers are stored column by column: the lowest byte of all of
-them first, then the next byte, and so on, with as many bytes as needed. `templates/replay.js` reads
-this format.
+2, ... become 0, 1, 2, 3, 4, ... The numbers are stored column by column: first the lowest byte of
+every number, then the next byte of every number, and so on. All numbers of a series have as many
+bytes as the largest one needs. `templates/replay.js` reads this format.
 """
 
 import colorsys
@@ -21,12 +21,13 @@ import numpy as np
 
 from swarmjax.replay.record import Recording, ReplayEpisode
 
-# Quanta. Positions (m), headings (rad), and the sum of each reward term since the start are off by
-# at most half of theirs.
+# Quanta of positions (m), headings (rad), and the sum of each reward term since the start. The
+# stored numbers are off by at most half a quantum.
 FINE = {"length": 2e-4, "angle": 1e-3, "reward": 1e-4}
-MANY = 100  # robots; the quanta of more are `COARSER` times as large, so that a page stays small
+# Swarms of more robots have quanta that are `COARSER` times as large, so that a page stays small.
+MANY = 100
 COARSER = 5
-RAY = 5e-4  # m; a ray is shown with the middle of its interval
+RAY = 5e-4  # quantum of ray lengths, m; a ray is shown with the middle of its interval
 MEASURE = 1e-3  # quantum of a goal's own measures
 # Colours for small swarms, distinct on light and dark pages.
 _PALETTE = (
@@ -118,7 +119,7 @@ def dark(reach: float) -> int:
 def _columns(
     recording: Recording, reach: float, quanta: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
-    """Returns the series [N, C] of a run by name, as integers; robots come first in C."""
+    """Returns the series [N, C] of a run by name, as integers. A robot's columns are adjacent."""
     rows, length = len(recording.pose), quanta["length"]
     ray = np.where(recording.ray < reach, np.floor(recording.ray / RAY), dark(reach))
     touch = recording.touching @ np.array([1, 2, 4])

@@ -24,9 +24,9 @@ def page(
 
     Args:
       settings: The replay's settings.
-      policies: The policies that drive.
+      policies: The policies that drive the robots.
       episodes: The recordings of each level.
-      words: The command that makes the page.
+      words: The command line that makes the page.
 
     Returns:
       HTML. Text about files and settings is either escaped or inside the packed data.
@@ -55,7 +55,7 @@ def fill(title: str, packed: bytes) -> str:
     """Puts title and data into the template.
 
     Args:
-      title: Title of the page, until its script opens another episode.
+      title: Title of the page until the page's script opens another episode.
       packed: The packed recordings, from `pack.pack`.
 
     Returns:

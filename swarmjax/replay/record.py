@@ -1,6 +1,6 @@
-"""Records episodes step by step from the judge in MuJoCo's C engine.
+"""Records episodes step by step in the judge, which is MuJoCo's C engine.
 
-Only shortest paths need JAX.
+JAX is needed only to measure shortest paths.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,19 +37,19 @@ class ReplayScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frames:
-    """What robots do in N frames, perhaps of A arenas. Frame 0 is the start.
+    """What robots do in N frames of A arenas. Frame 0 is the start. Recordings have no axis A.
 
     Attributes:
-      pose: [N, A, R, 3] x (m), y (m), yaw (rad); recordings have no axis A.
-      target: [N, A, R, 2] x (m), y (m).
+      pose: [N, A, R, 3] x (m), y (m), yaw (rad) of the robot.
+      target: [N, A, R, 2] x (m), y (m) of the robot's target.
       ray: [N, A, R, K] length of each infrared ray, m; at most the range of the electronics.
-      distance: [N, A, R] to the target, m.
+      distance: [N, A, R] distance to the target, m.
       touching: [N, A, R, 3] whether the robot touches something of each kind of `gaps.KINDS`.
       arrived: [N, A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         within its target.
-      contacts: [N, A, R, 3] contacts so far of each kind.
+      contacts: [N, A, R, 3] number of contacts so far, of each kind of `gaps.KINDS`.
       earns: [N, A, R] whether the robot earns the reward `arrival`.
-      measured: [N, A, K] the goal's own measures so far.
+      measured: [N, A, K] the values so far of the goal's own K measures.
     """
 
     pose: np.ndarray
@@ -63,20 +63,20 @@ class Frames:
     measured: np.ndarray
 
     def take(self, rows: Any) -> "Frames":
-        """Indexes all fields."""
+        """Indexes every field with `rows`."""
         return Frames(**{name: field[rows] for name, field in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording(Frames):
-    """A recorded episode: frames without the axis A, of one more than the control steps.
+    """A recorded episode: its frames, without the axis A. N is 1 + the number of control steps.
 
     Attributes:
       scene: The parts that do not move.
-      reward: [N, R] weighted reward of the step that led here, by term. It is 0 at the start
-        and, with `task.arrival=latch`, after arrival.
-      arrival: [R] control steps until the robot arrived, 0 if it never did; with `hold`, until
-        it was within its target for good.
+      reward: [N, R] weighted reward, by term, of the control step that led to the frame. It is 0
+        at the start and, with `task.arrival=latch`, after the robot's arrival.
+      arrival: [R] control steps until the robot arrived, or 0 if it never arrived. With
+        `task.arrival=hold`, control steps until the robot was within its target to stay.
     """
 
     scene: ReplayScene
@@ -99,7 +99,7 @@ class ReplayEpisode(NamedTuple):
 
 
 def weights(trained: Policy, task: TaskConfig) -> RewardConfig:
-    """Returns the weights that a policy was trained with; those of `task` if its file has none.
+    """Returns the reward weights in a policy's file, or those of `task` if the file has none.
 
     Raises:
       ConfigError: If the weights in the file are invalid.
@@ -115,10 +115,10 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
 
     Args:
       judge: Everything that the arenas share.
-      levels: The arenas' levels.
+      levels: The level of each arena.
 
     Returns:
-      Each episode up to the step in which all robots had arrived or the time was up.
+      A recording of each episode, which ends when all robots have arrived or the time is up.
 
     Raises:
       ConfigError: If the physics of an episode breaks down, or the policy's weights are invalid.
@@ -127,7 +127,8 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     arenas = engine_c.start(judge, levels)
     yaw, poses = arenas.factors.infrared_yaw, judge.config.robot.sensor_poses
     frames = [_look(judge, arenas)]
-    over = np.zeros(len(levels), bool)  # with `hold` robots may leave, but an episode stays over
+    # With `task.arrival=hold`, robots may leave their targets again, but an episode stays over.
+    over = np.zeros(len(levels), bool)
     memory = policy.begin(judge.policy, arenas.pose.shape[:2])
     while len(frames) <= judge.config.step_limit and not over.all():
         memory, action = engine_c.act(judge, memory, arenas)
@@ -168,7 +169,8 @@ def _cut(
     over = goal.is_over(frames.arrived, np.ones_like(frames.arrived))
     frames = frames.take(np.s_[: over.argmax() + 1 if over.any() else None])
     before = frames.arrived[:-1]
-    # A step is paid for the way to the target that the robot had, even if it gets another then.
+    # The reward of a step is for the target that the robot had when the step began, even if the
+    # robot gets another target in this step.
     distance, _ = observation.to_target(frames.pose[1:], frames.target[:-1], np)
     steps = reward.Step(
         distance_before=frames.distance[:-1],
@@ -195,7 +197,7 @@ def _cut(
 
 
 def _measure_paths(level: Level, pose: np.ndarray, hull_radius: float) -> np.ndarray:
-    """Measures shortest paths [N, R] (m) from poses [N, R, 3] to the targets as training does."""
+    """Measures the shortest paths [N, R] (m) from poses [N, R, 3] to targets, as training does."""
     import jax  # only for rewards along paths
 
     from swarmjax.task import geodesic
@@ -211,7 +213,10 @@ def _measure_paths(level: Level, pose: np.ndarray, hull_radius: float) -> np.nda
 
 
 def _since(arrived: np.ndarray) -> np.ndarray:
-    """Finds the row [R] at which robots arrive [N, R] and stay to the end; 0 if they never do."""
+    """Finds for each robot [R] the row of `arrived` [N, R] from which on all rows are True.
+
+    It is 0 for a robot that has not arrived in the last row.
+    """
     away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
     return np.where(arrived[-1], away + 1, 0)
 

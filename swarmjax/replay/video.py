@@ -1,7 +1,7 @@
 """Makes a video of a replay: MuJoCo's renderer draws the scene in 3-D and ffmpeg encodes it.
 
-The scene is built from the recording, only to be looked at. Robots, walls and obstacles have their
-true sizes. Targets are discs of their radius on the floor.
+The scene is built from the recording only to be looked at: nothing is simulated again. Robots,
+walls and obstacles have their true sizes. Targets are discs on the floor, with their true radius.
 """
 
 import math
@@ -24,10 +24,10 @@ from swarmjax.sim.model import HALF_HEIGHT
 
 FRAME_RATE = 30  # 1/s
 HOLD = 1.0  # s; the last frame of an episode stays this long
-HEIGHT = 720  # px; a picture is 16:9, two side by side are 4:3 each; as in scene.xml
-ELEVATION = math.radians(58.0)  # of the camera
+HEIGHT = 720  # px, as in scene.xml; one picture is 16:9, two side by side are 4:3 each
+ELEVATION = math.radians(58.0)  # angle at which the camera looks down
 FIELD_OF_VIEW = math.radians(40.0)  # vertical; as in scene.xml
-_MARGIN = 1.06  # around the arena
+_MARGIN = 1.06  # the picture shows an area larger than the arena by this factor
 _WALL = 0.015  # m; half of a wall's drawn thickness
 _FLAT = 5e-4  # m; half height of a target
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -91,8 +91,8 @@ def rows(settings: ReplayConfig, runs: Sequence[Recording]) -> list[int]:
       runs: Recordings of the level, one per policy, [N, ...] each; N may differ.
 
     Returns:
-      A row of the longest recording for each picture, from 0. The last row stays for `HOLD`
-      seconds.
+      For each picture a row of the longest recording, counted from 0. The last row stays for
+      `HOLD` seconds.
     """
     last = max(len(run.pose) for run in runs) - 1
     pace = 1.0 / (FRAME_RATE * settings.task.control_step)  # rows per picture
@@ -127,7 +127,7 @@ class _Shot:
         self.camera.distance = camera_distance(recording.scene.side, width / HEIGHT)
 
     def draw(self, row: int) -> np.ndarray:
-        """Draws one row of the recording; after its end, the last row."""
+        """Draws a row of the recording, or the last row if the recording is shorter."""
         row = min(row, len(self.recording.pose) - 1)
         pose = self.recording.pose[row]
         self.data.mocap_pos[:, :2] = pose[:, :2]
@@ -140,7 +140,7 @@ class _Shot:
 
 
 def build(settings: ReplayConfig, recording: Recording) -> mujoco.MjSpec:
-    """Describes the scene of an episode, with robots as bodies that the video places itself.
+    """Describes the scene of an episode. Robots are mocap bodies, which `_Shot.draw` places.
 
     Args:
       settings: The replay's settings.

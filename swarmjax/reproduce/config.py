@@ -30,19 +30,13 @@ class ReproduceConfig(Section):
     command: ClassVar[str] = "reproduce"
 
     seeds: int = setting(10, "number of seeds of each arm", LEAST_DRAWN, 4096)
-    budget: int = setting(
-        BUDGET, "arena control steps of a seed; below the default: no verdicts", UPDATE, _MOST
-    )
-    fine_tune: int = setting(
-        FINE_TUNE, "like budget, but for the arms NAME_expanded, in the 1.5 m arena", UPDATE, _MOST
-    )
+    budget: int = setting(BUDGET, "control steps of a seed; with fewer: no verdicts", UPDATE, _MOST)
+    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded, at 1.5 m", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
         None, "save and stop after so many minutes; resume=DIR continues", above=0.0
     )
-    out: str | None = setting(
-        None, "directory of the reproduction; null: runs/<date>-<time>-reproduce"
-    )
+    out: str | None = setting(None, "directory to write; null: runs/<date>-<time>-reproduce")
     resume: str | None = setting(None, "directory of the reproduction to continue")
 
     @property

@@ -10,8 +10,9 @@ class Command(NamedTuple):
     """A command of the package. `python -m swarmjax.NAME` runs it too.
 
     Attributes:
-      settings: module and name of the dataclass of its keys. Importing it must not need JAX.
-      meaning: its purpose, in one sentence.
+      settings: module and name of the dataclass with the command's keys. Importing this module
+        must not need JAX.
+      meaning: the command's purpose, in one sentence.
     """
 
     settings: str
@@ -38,7 +39,7 @@ COMMANDS: dict[str, Command] = {
 
 
 def settings(name: str) -> type[Section]:
-    """Imports the dataclass of a command's keys.
+    """Imports the dataclass with a command's keys.
 
     Args:
       name: one of `COMMANDS`.

@@ -52,7 +52,7 @@ def help_text() -> str:
 
 
 def _versions() -> str:
-    """Lists the versions of swarmjax and of what computes its results, on one line."""
+    """Lists on one line the versions of swarmjax and of the software that computes its results."""
     found = provenance.versions()
     names = [name for name in ("jax", "mujoco", "mujoco-mjx", "python") if name in found]
     return ", ".join(

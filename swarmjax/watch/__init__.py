@@ -2,5 +2,5 @@
 
 This package imports `pages`, the page of `report`, and the functions of `run` that read a run
 directory. `status.py` finds out whether a run trains, `live_page.py` draws the page, and
-`server.py` answers requests. Start with `live_page.LivePage`.
+`server.py` answers requests. Read `live_page.LivePage` first.
 """

@@ -8,7 +8,7 @@ from swarmjax.config import Section, about, setting
 
 @dataclass(frozen=True, kw_only=True)
 class WatchConfig(Section):
-    """Which run to follow, and on which port."""
+    """Settings: which run to follow, and the port of the page."""
 
     command: ClassVar[str] = "watch"
 

@@ -1,4 +1,7 @@
-"""Draws the page of a run: its status and its report, anew when the run has logged more."""
+"""Draws the page that follows a run: the run's status, and its report.
+
+The figures are drawn again when the run has logged more.
+"""
 
 import threading
 import time
@@ -27,20 +30,20 @@ class LivePage:
       trained: The run's config.
       history: The results that the figures show; None before the first update.
       figures: PNG files by name.
-      trouble: Why the newest drawing failed; empty if it did not.
+      trouble: Why the newest drawing failed; empty if it succeeded.
     """
 
     def __init__(self, run: Path) -> None:
         """Reads the run's config.
 
         Raises:
-          ConfigError: There is no valid config.
+          ConfigError: If the run has no valid config.
         """
         self.run, self.trained = run, rows.read_config(run)
         self.history: History | None = None
         self.figures: dict[str, bytes] = {}
         self.trouble = ""
-        self._drawn = 0  # bytes of METRICS; a run only adds to it
+        self._drawn = 0  # bytes of METRICS that the figures show; a run only adds to this file
         self._rests_until = 0.0
         self._lock = threading.Lock()  # two browsers may ask at once
 

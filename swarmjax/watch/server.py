@@ -1,9 +1,9 @@
 """Serves the page of a run to a browser on this machine.
 
-No request reads from disk, so no path leads to a file. Only this machine can connect. A foreign
-page may redirect its own name to this address (DNS rebinding), but its requests carry that name as
-Host and are refused. Without rebinding it cannot read answers either, since no answer allows
-another origin.
+The path of a request is never looked up on disk, so it cannot lead to a file. Only this machine can
+connect. A foreign page may redirect its own host name to this address (DNS rebinding), but its
+requests then carry that name as Host and are refused. Without rebinding, a foreign page cannot read
+answers either, because no answer allows another origin.
 """
 
 import sys
@@ -26,7 +26,7 @@ _SILENT_S = 10.0  # a connection that sends nothing for this long is closed
 
 
 class Server(ThreadingHTTPServer):
-    """Listens only on the loopback."""
+    """A server that listens only on the loopback address."""
 
     daemon_threads = True
 
@@ -52,24 +52,24 @@ class Server(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Address of the page."""
+        """The address of the page."""
         return f"http://{ADDRESS}:{self.server_port}/"
 
     @property
     def hosts(self) -> tuple[str, str]:
-        """Values that a browser on this machine sends as Host."""
+        """The values that a browser on this machine sends in the header Host."""
         return f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"
 
 
 class Answers(BaseHTTPRequestHandler):
-    """Answers one connection."""
+    """Answers the requests of one connection."""
 
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
     server_version, sys_version = "swarmjax", ""
     timeout = _SILENT_S
 
-    def do_GET(self) -> None:  # the name that the library calls; it refuses other methods
-        """Answers with the page."""
+    def do_GET(self) -> None:  # the library calls this name, and refuses other HTTP methods
+        """Answers a request with the page."""
         if self.headers.get_all("Host") not in [[host] for host in self.server.hosts]:
             self._send(HTTPStatus.MISDIRECTED_REQUEST, "text/plain", f"Open {self.server.url}\n")
         elif self.path.partition("?")[0] != "/":

@@ -1,4 +1,4 @@
-"""Finds out from its directory whether a run trains, has ended or has stopped early."""
+"""Finds out from a run's directory whether the run trains, has ended or has stopped early."""
 
 import time
 from pathlib import Path
@@ -15,7 +15,7 @@ SILENT_S = 120.0
 
 
 class RunStatus(NamedTuple):
-    """State of a run, also as a sentence for a person to read."""
+    """State of a run, as a word for programs and as a sentence for people."""
 
     state: Literal["trains", "ended", "stopped"]
     sentence: str
@@ -25,9 +25,9 @@ def read(run: Path, trained: TrainConfig, history: History | None) -> RunStatus:
     """Returns the current state of a run.
 
     Args:
-      run: its directory.
-      trained: its config.
-      history: its logged results; None before the first update.
+      run: the run's directory.
+      trained: the run's config.
+      history: the run's logged results; None before the first update.
     """
     done = 0 if history is None else int(history.updates[-1]) + 1
     so_far = f"{done:,} of {words.count(trained.updates, 'update')}"
