@@ -45,8 +45,8 @@ LARGE = Launch(tile=128, programs=264, warps=8)
 _LEAST_TILES = 8
 
 # The metrics of a step with kernels: those of `gradients.ppo_loss` if the critic sees only the
-# observation, the norm of the gradient before clipping, and two flags. One flag is 1 if the step was
-# taken, the other is 1 if the step was skipped.
+# observation, the norm of the gradient before clipping, and two flags. One flag is 1 if the step
+# was taken, the other is 1 if the step was skipped.
 METRICS = (
     "approx_kl",
     "bound_loss",
