@@ -130,7 +130,7 @@ def is_written(run: Path) -> bool | None:
     This does not try to acquire the lock, which would keep out a run that begins at that moment.
 
     Returns:
-      Whether it runs; None if it ran on another machine, where this cannot be found out.
+      Whether the process still runs; None if it was started on another machine.
     """
     try:
         process, host = (run / LOCK).read_text().splitlines()

@@ -150,7 +150,7 @@ def carry_over(
     If each robot has a learner and the swarm grows beyond its largest size so far, the learners of
     the new robots become copies of the other learners, in turn: parameters, optimiser and
     normaliser. Then the optimiser and the exploration of all learners are reset or kept, as
-    `config.curriculum` says. If there is nothing to copy or reset, this costs no time.
+    `config.curriculum` says. Nothing is computed if there is nothing to copy or reset.
 
     Args:
       learners: [L] the learners.
