@@ -28,17 +28,15 @@ class CurriculumConfig(Section):
 
     mode: str = setting(
         "mixed",
-        "where the arenas train; sequential: all on the newest stage; mixed: most on the newest "
-        "stage, some on earlier stages; adaptive: on all stages, with more arenas on a stage with "
-        "a higher score; frontier: on the stages whose easier neighbours are learned; or the name "
-        "of an extension's curriculum",
+        "sequential: all arenas on the newest stage; mixed: most on the newest, some on earlier "
+        "stages; adaptive: on all stages, more on those with a higher score; frontier: on stages "
+        "whose easier neighbours are learned; or the name of an extension's curriculum",
     )
     axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
         default_factory=ByName,
         metadata=about(
-            "easier values of the stage's numbers: a list for each number's name, from easy to "
-            "hard, without the stage's own value; each combination becomes a stage, and mode is "
-            "frontier unless given"
+            "easier values of the stage's numbers: a list from easy to hard for each name; each "
+            "combination becomes a stage, and mode is frontier unless given"
         ),
     )
     success: Literal["targets", "all"] = setting(
@@ -55,8 +53,7 @@ class CurriculumConfig(Section):
     )
     budget_share: float = setting(
         0.5,
-        "share of the budget that all stages before the last may spend together; each stage gets "
-        "an equal part [sequential, mixed]",
+        "share of the budget for all stages before the last, divided equally [sequential, mixed]",
         above=0.0,
         below=1.0,
     )
@@ -76,13 +73,11 @@ class CurriculumConfig(Section):
         "arenas, so that the numbers of samples follow the weights [adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
-        "keep",
-        "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]",
+        "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
         "keep",
-        "what a promotion does to the action's standard deviation; reset: set it to "
-        "algo.initial_std [sequential, mixed]",
+        "exploration after a promotion; reset: begin at algo.initial_std [sequential, mixed]",
     )
 
     def _check(self) -> None:

@@ -112,8 +112,8 @@ def draw_starts(
     """Draws the levels of episodes that wait until their arena is free.
 
     The levels are drawn before a rollout, `program.waiting` for each arena, and not at every step.
-    An arena that runs out of levels repeats the last level. The learners also learn from repeats, but
-    no cohort counts them: otherwise short episodes would count more often than long ones.
+    An arena that runs out of levels repeats the last level. The learners also learn from repeats,
+    but no cohort counts them: otherwise short episodes would count more often than long ones.
 
     Args:
       world: the compiled environment.
