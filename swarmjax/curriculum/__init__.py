@@ -1,6 +1,6 @@
 """The curriculum: which stage each arena trains on, and when that changes.
 
-It imports `task` for stages and for ended episodes. `engine.py` has the protocol of a curriculum,
-and counts and judges episodes. `stages.py` has one pure function for each mode. `log.py` writes
-decisions as log entries. Start with `engine.observe`.
+The package imports `task` for stages and for ended episodes. `engine.py` defines the protocol of a
+curriculum, counts ended episodes and measures success. `stages.py` has one pure function for each
+mode. `log.py` writes decisions as log entries. Start with `engine.observe`.
 """

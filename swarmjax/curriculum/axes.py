@@ -1,8 +1,8 @@
 """Curricula along axes: a stage, and easier values of its numbers, become a grid of stages.
 
 With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
-an axis is the stage's own, so the last stage is the stage itself. Stages count the first axis
-slowest.
+an axis is the stage's own, so the last stage is the stage itself. From one
+stage to the next, the last axis changes fastest.
 """
 
 import itertools
@@ -18,22 +18,22 @@ from swarmjax.task.layouts.site import NUMBERS
 from swarmjax.task.stage_files import complete
 
 AXES = ("robots", "side", "distance", "obstacles", "obstacle_size", "breadth", "cells", *NUMBERS)
-MOST_STAGES = 64  # of a grid; each has its own record and its own column in the log
+MOST_STAGES = 64  # of a grid; each stage has a record and a column in the log
 
 
 def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Makes the stages of a grid.
 
     Args:
-      stage: plain data of the goal.
-      axes: values of each axis, from easy to hard, without the stage's own.
+      stage: plain data of the stage that becomes the last one.
+      axes: values of each axis, from easy to hard, without the stage's own value.
 
     Returns:
-      Plain data of the stages; the last is the goal.
+      Plain data of the stages; the last one is `stage`.
 
     Raises:
-      ConfigError: an axis is unknown, empty or ends at the stage's own value, or the grid is too
-        large.
+      ConfigError: an axis is unknown or empty, or holds an invalid value, a value twice or the
+        stage's own value; or the grid is too large.
     """
     for key, values in axes.items():
         _check(stage, key, values)
@@ -53,7 +53,7 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
 
 
 def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
-    """Refuses an axis that is unknown, empty, or ends at the stage's own value."""
+    """Refuses an axis that is unknown or has invalid values."""
     if key not in AXES:
         raise ConfigError(f"curriculum.axes.{key} is no axis: give one of {', '.join(AXES)}.")
     if not isinstance(values, Sequence) or isinstance(values, str) or not values:
@@ -92,7 +92,7 @@ def easier(axes: Mapping[str, Sequence[Any]], stages: int) -> np.ndarray:
 
     Returns:
       [S, S] bool; entry (i, j) is true if stage j is one step easier than stage i on one axis. In a
-      sequence, that is the stage before.
+      sequence, stage j is the stage before stage i.
     """
     sizes = [len(values) + 1 for values in axes.values()] or [stages]
     place = np.stack(np.unravel_index(np.arange(stages), sizes), axis=-1)

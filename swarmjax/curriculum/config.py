@@ -10,7 +10,7 @@ from swarmjax.extension import OwnCurriculum
 
 PROMOTING = ("sequential", "mixed")  # modes that move from stage to stage
 MODES = (*PROMOTING, "adaptive", "frontier")
-# The modes that read an option.
+# By option: the key `mode`, and the modes that read the option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     **dict.fromkeys(("budget_share", "optimizer", "exploration"), ("mode", PROMOTING)),
     **dict.fromkeys(("score", "shares"), ("mode", ("adaptive",))),
@@ -21,39 +21,39 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
-    """Which arenas train on which stage, when that changes, and what a promotion changes.
+    """Settings: which arenas train on which stage, when that changes, and what a promotion changes.
 
-    Some options are read only by the modes that their meanings name in brackets.
+    Some options are read only by some modes. Their texts end with these modes, in brackets.
     """
 
     mode: str = setting(
         "mixed",
-        "sequential: all arenas on the newest stage; mixed: some on earlier stages; adaptive: "
-        "on all stages, more of them on stages with a higher score; frontier: on the stages whose "
-        "easier neighbours are learned; or the name of an extension's curriculum",
+        "sequential: all arenas on the newest stage; mixed: most on the newest, some on earlier "
+        "stages; adaptive: on all stages, more on those with a higher score; frontier: on stages "
+        "whose easier neighbours are learned; or the name of an extension's curriculum",
     )
     axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
         default_factory=ByName,
         metadata=about(
-            "easier values of the stage's numbers, from easy to hard, by name; each combination "
-            "becomes a stage, and mode is frontier unless given"
+            "easier values of the stage's numbers: a list from easy to hard for each name; each "
+            "combination becomes a stage, and mode is frontier unless given"
         ),
     )
     success: Literal["targets", "all"] = setting(
         "targets",
-        "measure of success; targets: share of targets reached; all: share of episodes in "
-        "which all robots arrived",
+        "measure of success; targets: share of targets that were reached; all: share of episodes "
+        "in which all robots arrived",
     )
     threshold: float | tuple[float, ...] = setting(
         0.8,
-        "success at which a stage is learned, or a list with one for each stage "
+        "success at which a stage is learned: one number, or a list with one for each stage "
         "[sequential, mixed, frontier]",
         0.0,
         1.0,
     )
     budget_share: float = setting(
         0.5,
-        "share of the budget for all stages before the last, in equal parts [sequential, mixed]",
+        "share of the budget for all stages before the last, divided equally [sequential, mixed]",
         above=0.0,
         below=1.0,
     )
@@ -63,20 +63,21 @@ class CurriculumConfig(Section):
     )
     floor: float = setting(
         0.1,
-        "share of the arenas spread evenly over all stages [adaptive, frontier]",
+        "share of the arenas that is spread evenly over all stages [adaptive, frontier]",
         above=0.0,
         high=1.0,
     )
     shares: Literal["arenas", "robots"] = setting(
         "arenas",
-        "what the weights divide among stages; robots: a stage with many robots gets fewer "
-        "arenas, so that the samples follow the weights [adaptive]",
+        "what the stages' weights are shares of; robots: a stage with many robots gets fewer "
+        "arenas, so that the numbers of samples follow the weights [adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
-        "keep", "Adam's moments at a promotion; reset: set them to 0 [sequential, mixed]"
+        "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep", "exploration at a promotion; reset: set it to algo.initial_std [sequential, mixed]"
+        "keep",
+        "exploration after a promotion; reset: begin at algo.initial_std [sequential, mixed]",
     )
 
     def _check(self) -> None:

@@ -1,12 +1,13 @@
 """The protocol of a curriculum, and how success is measured for every curriculum.
 
 A curriculum chooses the stages of the next episodes, and observes how episodes ended. Both are pure
-functions of its own state, on the device. `stages.py` has the built-in modes.
+functions of the curriculum's own state, and run on the device. `stages.py` has the built-in modes.
 
 Success is measured on each stage, without favouring short episodes. A cohort holds all episodes
-that began within one step limit. The verdict on a cohort comes one step limit after that, when the
-cohort's last episode has ended. An earlier verdict would count only the short episodes, which are
-the lucky ones. An episode counts for the stage and the cohort in which it began.
+that began within a period as long as the step limit of an episode. The verdict on a cohort comes
+one step limit after this period, when the cohort's last episode has ended. An earlier verdict
+would count only the short episodes, which are the lucky ones. An episode counts for the stage and
+the cohort in which it began.
 """
 
 import math
@@ -28,18 +29,17 @@ from swarmjax.task.stage import Stage
 
 STAYED, BY_THRESHOLD, BY_BUDGET, REWEIGHED = range(4)
 REASONS = ("stayed", "threshold", "budget", "reweighed")
-NEVER = np.iinfo(np.int32).max  # as a deadline
-# Cohort of an episode that does not count. Cohorts have numbers from 0, and -1 is the cohort before
-# the first.
+NEVER = np.iinfo(np.int32).max  # deadline of a stage that has none
+# Cohort number of an episode that does not count. Cohorts have numbers from 0, and -1 is the cohort
+# before the first.
 UNCOUNTED = -2
-# A verdict on n trials moves `fast` towards the success in these trials, by n / (n + 20) of the
-# way. The old result then counts as much as 20 trials. A few episodes then cannot outweigh many
-# earlier ones.
+# A verdict on n trials moves `Record.fast` towards the success in these trials, by n / (n + 20) of
+# the way. The value before the verdict thus counts as much as 20 trials, so that a few episodes
+# cannot outweigh many earlier ones.
 _PRIOR_TRIALS = 20.0
-# Before the first verdict, these 20 trials count with a success of one half, where p (1 - p) is
-# largest.
+# At the first verdict, the value before it is a success of one half, where p (1 - p) is largest.
 _PRIOR_SUCCESS = 0.5
-# A figure that was not measured. It is not NaN, because JAX_DEBUG_NANS looks for NaN.
+# Value of a metric that was not measured. It is not NaN, because JAX_DEBUG_NANS looks for NaN.
 UNKNOWN = -math.inf
 
 Success = Literal["targets", "all"]
@@ -53,8 +53,8 @@ class Schedule(NamedTuple):
       deadline: [S] update at which the stage ends at the latest, int32.
       threshold: [S] success at which the stage is learned.
       floor: [] share of the arenas that is spread evenly over all stages.
-      cohort_updates: [] updates of one step limit, int32.
-      easier: [S, S] whether the second stage has to be learned before the first opens, bool.
+      cohort_updates: [] how many updates last one step limit, int32.
+      easier: [S, S] bool; entry (i, j): whether stage j has to be learned before stage i opens.
     """
 
     stages: Stage
@@ -66,12 +66,13 @@ class Schedule(NamedTuple):
 
 
 class StageChoice(NamedTuple):
-    """What is trained now.
+    """The stages that are trained now.
 
     Attributes:
       stage: [] index of the newest stage, int32.
       weights: [S] share of the arenas on each stage, float32; their sum is 1.
-      reason: [] why it changed, an index of `REASONS`, int32; `STAYED` if it did not.
+      reason: [] why the choice changed in this update, an index of `REASONS`, int32; `STAYED` if it
+        did not change.
     """
 
     stage: Array
@@ -80,7 +81,9 @@ class StageChoice(NamedTuple):
 
 
 class CohortTally(NamedTuple):
-    """Ended episodes of one cohort, by the stage on which they began, [S] each.
+    """Counts of the ended episodes of one cohort, by the stage on which the episodes began.
+
+    Each field is [S].
 
     Attributes:
       episodes: number of episodes, int32.
@@ -88,7 +91,7 @@ class CohortTally(NamedTuple):
       reached: robots that arrived, int32.
       complete: episodes in which every robot arrived, int32.
       contacts: contacts of all kinds, over all robots, int32.
-      reward: sum over all robots, float32.
+      reward: sum of the rewards of all robots, float32.
     """
 
     episodes: Array
@@ -100,17 +103,17 @@ class CohortTally(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The record of each stage, [S] each.
+    """The record of each stage. Each field is [S].
 
-    Before a stage's first verdict, `episodes` is 0 and all other figures are `UNKNOWN`.
+    Before a stage's first verdict, `episodes` is 0 and all other fields are `UNKNOWN`.
 
     Attributes:
       episodes: episodes of the newest verdict, int32.
       success: share of targets that were reached in these episodes.
       complete: share of these episodes in which every robot arrived.
-      contacts: per robot.
-      reward: per robot.
-      fast: running mean of the deciding success.
+      contacts: contacts per robot in these episodes.
+      reward: reward per robot in these episodes.
+      fast: running mean of the deciding success, which `curriculum.success` selects.
     """
 
     episodes: Array
@@ -121,19 +124,19 @@ class Record(NamedTuple):
     fast: Array
 
     def deciding(self, success: Success) -> Array:
-        """Returns the newest success [S] by a measure: of targets, or of all robots together."""
+        """Returns the newest success [S] by the given measure: `success` or `complete`."""
         return {"targets": self.success, "all": self.complete}[success]
 
 
 @struct.dataclass(kw_only=True)
 class Cohorts:
-    """The measurement of all stages.
+    """The two newest cohorts, and the record of all stages.
 
     Attributes:
       number: [] number of the cohort in which episodes now begin, int32.
       age: [] updates since that cohort began, int32.
-      current: ended episodes of this cohort.
-      previous: ended episodes of the cohort before.
+      current: ended episodes of that cohort.
+      previous: ended episodes of the cohort before that cohort.
       record: the record of each stage.
     """
 
@@ -145,11 +148,13 @@ class Cohorts:
 
 
 class CohortVerdict(NamedTuple):
-    """The findings of an update.
+    """What the cohorts show after an update.
 
     Attributes:
-      over: [] whether a cohort is over. All episodes of the cohort before it have then ended.
-      judged: [S] whether the cohort before had episodes on the stage; all False unless `over`.
+      over: [] whether the current cohort is over. All episodes of the previous cohort have then
+        ended.
+      judged: [S] whether the stage has a new verdict, because the previous cohort had episodes on
+        it; all False unless `over`.
       success: [S] deciding success of each stage's newest verdict; `UNKNOWN` before the first.
       record: the record of each stage.
     """
@@ -166,7 +171,7 @@ class CurriculumOutcomes(NamedTuple):
     Attributes:
       ended: [T, A] episodes that ended, of all devices.
       verdict: what the cohorts show so far.
-      update: [] number of the finished update, int32.
+      update: [] number of the finished update, from 0, int32.
     """
 
     ended: Ended
@@ -175,13 +180,14 @@ class CurriculumOutcomes(NamedTuple):
 
 
 class Curriculum(NamedTuple):
-    """A curriculum, with the numbers of its schedule.
+    """A curriculum for a given schedule.
 
     Attributes:
-      init: returns its state before the first update. The field `chosen` of a state is a
-        `StageChoice`.
+      init: returns the curriculum's own state before the first update. The field `chosen` of
+        a state is a `StageChoice`.
       choose: (state, key, free) -> [W, A] stage on which the next episodes of each arena begin,
-        int32; free is (W, A), and the key is the same on all devices.
+        int32. free is (W, A): the next W episodes of A arenas. The key is the same on all
+        devices.
       observe: (state, outcomes) -> state.
     """
 
@@ -195,9 +201,9 @@ class CurriculumState:
     """The state of a run's curriculum.
 
     Attributes:
-      own: state of the curriculum itself.
-      cohorts: measurement of all stages.
-      met: [] most robots of any stage so far, int32.
+      own: the curriculum's own state, as `Curriculum.init` makes it.
+      cohorts: the two newest cohorts, and the record of all stages.
+      met: [] most robots of any stage that was trained so far, int32.
     """
 
     own: Any
@@ -206,7 +212,7 @@ class CurriculumState:
 
     @property
     def chosen(self) -> StageChoice:
-        """What is trained now."""
+        """The stages that are trained now."""
         return self.own.chosen
 
 
@@ -215,7 +221,7 @@ def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
 
     Args:
       curriculum: the curriculum.
-      schedule: its numbers.
+      schedule: the curriculum's numbers.
 
     Returns:
       The state before the first update.
@@ -239,9 +245,9 @@ def observe(
 
     Args:
       curriculum: the curriculum.
-      schedule: its numbers.
-      success: the deciding success.
-      state: its state.
+      schedule: the curriculum's numbers.
+      success: the measure of success by which the curriculum decides.
+      state: the state before these episodes are counted.
       ended: [T, A] episodes that ended, of this device.
       update: [] number of the finished update, from 0.
       shards: how the arenas are spread over devices.
@@ -261,7 +267,7 @@ def observe(
 
 
 def init_cohorts(stages: int) -> Cohorts:
-    """Returns the measurement of S stages before the first episode."""
+    """Returns the cohorts and the record of S stages before the first episode."""
     zero, unknown = jnp.zeros((), jnp.int32), jnp.full(stages, UNKNOWN, jnp.float32)
     return Cohorts(
         number=zero,
@@ -282,12 +288,12 @@ def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
     """Adds ended episodes to the cohort and the stage in which they began.
 
     Args:
-      cohorts: before.
+      cohorts: the cohorts before.
       ended: [T, A]; only episodes of the last two cohorts count.
       shards: how the arenas are spread over devices.
 
     Returns:
-      The measurement with new tallies.
+      The cohorts with new tallies.
     """
     chex.assert_rank(ended.cohort, 2)
     chex.assert_equal_shape([ended.cohort, ended.stage, ended.targets, ended.reached])
@@ -301,15 +307,15 @@ def count(cohorts: Cohorts, ended: Ended, shards: Shards = ALONE) -> Cohorts:
 def conclude(
     cohorts: Cohorts, updates: Array | np.int32, success: Success
 ) -> tuple[Cohorts, CohortVerdict]:
-    """Ends an update; if a cohort is over, records the one before.
+    """Ends an update; if the current cohort is over, records the previous one.
 
     Args:
-      cohorts: after `count`.
-      updates: [] updates of a cohort, int32.
-      success: which success the running mean follows.
+      cohorts: the cohorts, as `count` returns them.
+      updates: [] how many updates a cohort lasts, int32.
+      success: the measure of success that the running mean follows.
 
     Returns:
-      The measurement with the new record, and the verdict.
+      The cohorts with the new record, and the verdict.
     """
     age = cohorts.age + 1
     over = age >= updates
@@ -354,7 +360,7 @@ def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> Coh
 
 
 def _record(record: Record, tally: CohortTally, judged: Array, success: Success) -> Record:
-    """Records a whole cohort for the stages [S] on which it had episodes."""
+    """Records a cohort whose episodes have all ended, for the stages [S] on which it had any."""
     robots, episodes = jnp.maximum(tally.targets, 1), jnp.maximum(tally.episodes, 1)
     newest = Record(
         episodes=tally.episodes,
@@ -372,5 +378,5 @@ def _record(record: Record, tally: CohortTally, judged: Array, success: Success)
 
 
 def _robots(chosen: StageChoice, schedule: Schedule) -> Array:
-    """Returns the most robots of the stages that are trained now."""
+    """Returns the largest number of robots of any stage that is trained now."""
     return jnp.max(jnp.where(chosen.weights > 0.0, jnp.asarray(schedule.stages.robots), 0))

@@ -1,4 +1,4 @@
-"""The decision log: each decision of the curriculum and the figures behind it."""
+"""The decision log: each decision of the curriculum and the metrics behind it."""
 
 from collections.abc import Sequence
 
@@ -9,15 +9,16 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
     """Turns rows of metrics into the decision log.
 
     Args:
-      rows: metrics, a row for each update of a seed, with the names of `loop.update`; lists by
-        stage.
+      rows: metrics, one row for each update of one seed, with the names that `loop.update` uses.
+        Metrics by stage are lists.
       names: names of the stages.
       seed: seed to write into the entries.
 
     Returns:
       One entry for each decision: `update`, `seed` and `why`. A promotion also has
       `from`, `to` and the results on the stage that was left (`targets_reached`, `all_reached`,
-      `episodes`). New weights have `weights` and `success`, by stage.
+      `episodes`). An entry for new weights also has `weights` and
+      `success`, each by the name of the stage.
     """
     return [
         {"update": row["update"], "seed": seed, **_entry(row, names)}
@@ -27,7 +28,7 @@ def log(rows: Sequence[dict], names: Sequence[str], seed: int) -> list[dict]:
 
 
 def _entry(row: dict, names: Sequence[str]) -> dict:
-    """Describes the decision of an update, with the figures behind it."""
+    """Describes the decision of an update, with the metrics behind it."""
     why = {"why": REASONS[row["decision"]]}
     if row["decision"] == REWEIGHED:
         figures = {"weights": row["weights"], "success": row["estimate_by_stage"]}

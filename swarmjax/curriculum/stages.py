@@ -2,7 +2,7 @@
 
 A mode is one pure function. After each update it gets the newest verdicts and returns the newest
 stage, the share of the arenas on each stage, and the reason. A mode is also called before the first
-update, without verdicts, and then returns where a run begins.
+update, without verdicts, and then returns the choice with which a run begins.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,10 +31,10 @@ from swarmjax.curriculum.engine import (
 from swarmjax.extension import OwnCurriculum
 from swarmjax.task import extended
 
-# Share of the arenas on earlier stages with `mixed`, on learned ones with `frontier`: this
-# project's choice.
+# Share of the arenas on earlier stages with `mixed`, and on learned stages with `frontier`. This
+# project chose the value.
 _EARLIER = 0.2
-_UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
+_UNKNOWN_LEARNABILITY = 0.25  # largest p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)
@@ -45,7 +45,7 @@ class StagesState:
     """The state of a mode.
 
     Attributes:
-      chosen: what is trained now.
+      chosen: the stages that are trained now.
       turn: [] number of cohorts so far, int32.
       since: [] value of `turn` from which the newest decision holds, int32.
     """
@@ -61,7 +61,7 @@ Mode = Callable[[StagesState, Schedule, CurriculumConfig, CohortVerdict, Array],
 def make(
     schedule: Schedule, options: CurriculumConfig, own: Sequence[OwnCurriculum] = ()
 ) -> Curriculum:
-    """Makes the curriculum that the settings mean.
+    """Makes the curriculum that the settings select.
 
     Args:
       schedule: the curriculum's numbers.
@@ -103,12 +103,12 @@ def _of_mode(schedule: Schedule, options: CurriculumConfig) -> Curriculum:
 def assign(weights: Array, turn: Array, arenas: int) -> Array:
     """Chooses the stage [A] on which the next episode of each arena begins.
 
-    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line. So a
-    stage's weight is its share of the arenas, and also its share of the time. From cohort to
-    cohort, u moves by the golden ratio. If there are few arenas, each arena visits every stage over
-    time. If there are many arenas, most of them stay on their stage. That matters because an arena
-    that moves must wait until its episode ends. If all arenas moved, stages with long episodes
-    would get more than their share.
+    The weights divide a line into stages. Arena a is at the point (a + u) / A of this line,
+    with u within 0..1. So a stage's weight is its share of the arenas, and also its share of time.
+    From cohort to cohort, u moves by the golden ratio. If there are few arenas, each arena visits
+    every stage over time. If there are many arenas, most of them stay on their stage. That matters
+    because an arena that moves must wait until its episode ends. If all arenas moved, stages with
+    long episodes would get more than their share.
 
     Args:
       weights: [S] share of the arenas on each stage.
@@ -135,16 +135,16 @@ def promoting(
     verdict: CohortVerdict,
     update: Array,
 ) -> StageChoice:
-    """Moves the arenas on to the next stage; `mixed` keeps some of them on earlier stages, evenly.
+    """Moves the arenas on to the next stage; `mixed` spreads some over earlier stages.
 
-    The next stage begins when a whole cohort of the current stage has reached its threshold, or at
-    its deadline. At least one step limit lies between two decisions.
+    The next stage begins when a whole cohort of the current stage has reached the threshold of this
+    stage, or at the deadline of this stage. At least one step limit lies between two decisions.
 
     Args:
       state: state of the mode.
       schedule: the curriculum's numbers.
       options: settings of the curriculum.
-      verdict: findings of the update.
+      verdict: what the cohorts show after the update.
       update: [] number of the finished update, from 0; -1 before the first.
 
     Returns:
@@ -190,7 +190,7 @@ def adaptive(
       update: as in `promoting`.
 
     Returns:
-      The choice from the next update on; its newest stage is the last one.
+      The choice from the next update on; its field `stage` is the last stage.
     """
     stages = state.chosen.weights.shape[0]
     score = _score(verdict.record, options.score)
@@ -199,7 +199,7 @@ def adaptive(
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
     if options.shares == "robots":
-        # The shares of arenas that give these shares of robots.
+        # Shares of arenas with which each stage's share of the robots is its weight.
         arenas = weights / jnp.asarray(schedule.stages.robots).astype(jnp.float32)
         weights = arenas / jnp.sum(arenas)
     judged = verdict.over & jnp.any(verdict.judged)
@@ -217,7 +217,7 @@ def frontier(
     verdict: CohortVerdict,
     update: Array,
 ) -> StageChoice:
-    """Trains the open stages that are not learned yet, and keeps some arenas on learned ones.
+    """Trains the open stages that are not learned, and keeps some arenas on learned stages.
 
     A stage is learned while its running success is at least its `threshold`. It is open while all
     stages one step easier are learned. So success widens the frontier, failure narrows it, and no
@@ -233,7 +233,7 @@ def frontier(
       update: as in `promoting`.
 
     Returns:
-      The choice from the next update on; its newest stage is the hardest of the frontier.
+      The choice from the next update on; its field `stage` is the last stage of the frontier.
     """
     stages = state.chosen.weights.shape[0]
     index, easier = jnp.arange(stages), jnp.asarray(schedule.easier)

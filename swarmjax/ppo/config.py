@@ -33,9 +33,7 @@ class AlgoConfig(Section):
         "shared", "shared: one policy for all robots; independent: one policy for each robot"
     )
     network: str | None = setting(
-        None,
-        "network of actor and critic: mlp, or the name of a network in extensions; null: the "
-        "extension's network if it has one, otherwise mlp",
+        None, "network of actor and critic: mlp or an extension's; null: the extension's, else mlp"
     )
     hidden_sizes: tuple[int, ...] = setting((64, 64), "widths of the hidden layers", 1, 4096)
     memory: Literal["none", "gru"] = setting(
@@ -55,14 +53,10 @@ class AlgoConfig(Section):
         "activation of the mean action; tanh: keeps the action within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
-        "orthogonal",
-        "initial weights; uniform: weights and biases within +-1 / sqrt(inputs of the layer), "
-        "as in PyTorch",
+        "orthogonal", "first weights; uniform: within +-1 / sqrt(inputs), biases too, as in PyTorch"
     )
     normalize_observations: bool = setting(
-        True,
-        "shift and scale observations by their running mean and standard deviation; false: use raw "
-        "observations; both are clipped to +-10",
+        True, "normalise observations by running mean and deviation; false: raw; both clip to +-10"
     )
     rollout_length: int = setting(32, "control steps of each arena per update", 1, MAX_COUNT)
     epochs: int = setting(1, "passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
@@ -72,9 +66,8 @@ class AlgoConfig(Section):
     )
     advantage: Literal["gae", "monte_carlo"] = setting(
         "gae",
-        "gae: generalised advantage estimation, bootstrapped also where the step limit ends an "
-        "episode; monte_carlo: the critic and the advantages use normalised returns up to the "
-        "end of the episode or rollout",
+        "gae: bootstrapped, also at the step limit; monte_carlo: the critic and the advantages "
+        "use normalised returns up to the end of the episode or rollout",
     )
     gae_lambda: float = setting(0.95, "GAE's lambda [advantage=gae]", 0.0, 1.0)
     clip_epsilon: float = setting(
@@ -89,8 +82,7 @@ class AlgoConfig(Section):
     )
     critic_learning_rate: float | None = setting(
         None,
-        "learning rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced by the "
-        "same factor as that of the policy",
+        "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced as the policy's",
         above=0.0,
         high=1.0,
     )
@@ -101,15 +93,12 @@ class AlgoConfig(Section):
     max_grad_norm: float | None = setting(
         0.5, "norm at which gradients are clipped; null: no clipping", above=0.0
     )
-    value_cost: float = setting(
-        0.5, "weight of the value loss, which is half the mean squared error", 0.0
-    )
+    value_cost: float = setting(0.5, "weight of the value loss, half the mean squared error", 0.0)
     entropy_cost: float = setting(0.0, "weight of the entropy bonus", 0.0)
     update_backend: Literal["auto", "autodiff"] = setting(
         "auto",
-        "how to compute gradients; auto: by GPU kernels if there is an NVIDIA GPU and the kernels "
-        "support the layers; with a memory, by autodiff that leaves out the rollouts of absent "
-        "robots",
+        "how to compute gradients; auto: by GPU kernels if these support the GPU and the layers; "
+        "with a memory, by autodiff that leaves out the rollouts of absent robots",
     )
     exploration: Literal["learned", "scheduled"] = setting(
         "learned", "standard deviation of the action: learned, or falling in steps by a schedule"

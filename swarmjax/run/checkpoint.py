@@ -7,8 +7,8 @@ A checkpoint is a folder, `checkpoints/UPDATE`:
 - `meta.json` has the update, the run, a digest of its config and a digest of the arrays.
 - `SHA256SUMS` has a digest of each file. `sha256sum -c SHA256SUMS` checks it.
 
-So a damaged, renamed or foreign checkpoint is detected, and reading falls back to the newest sound
-one. Resuming is exact.
+So a checkpoint that is damaged, renamed or from another run is detected, and reading falls back to
+the newest sound checkpoint. Resuming restores the state of the run exactly.
 """
 
 import functools
@@ -35,7 +35,7 @@ from swarmjax.run.errors import CheckpointError, TrainingError
 
 Leaves = dict[str, np.ndarray]
 
-KEPT = 2  # how many of the newest checkpoints are kept: the older one serves if one is damaged
+KEPT = 2  # how many checkpoints are kept: the older one serves if the newest is damaged
 FOLDER = hosts.CHECKPOINTS
 _STATE, _META, _SUMS = "state", "meta.json", "SHA256SUMS"
 _TEMPORARY = ".{}.tmp"  # the name of a folder while it is written or removed
@@ -45,10 +45,10 @@ class Kept(NamedTuple):
     """A sound checkpoint.
 
     Attributes:
-      leaves: the arrays, as `to_leaves` gave them.
-      update: updates that were done.
+      leaves: the arrays, as `to_leaves` returns them.
+      update: number of updates that were done.
       skipped: a sentence for each newer checkpoint that is damaged.
-      logs: bytes of each log at this checkpoint, by name.
+      logs: length of each log at this checkpoint, in bytes, by name.
     """
 
     leaves: Leaves
@@ -69,7 +69,7 @@ def steps(run: Path) -> list[int]:
 
 
 def _owner(run: Path) -> dict[str, Any]:
-    """Returns what names a run and its config in a checkpoint; nothing without a config."""
+    """Returns the id of a run and the digest of its config; empty without a readable config."""
     try:
         stored = json.loads((run / directory.CONFIG).read_text())
         return {"run": stored["run"]["id"], "config": directory.config_digest(stored)}
@@ -80,20 +80,20 @@ def _owner(run: Path) -> dict[str, Any]:
 class Checkpoints:
     """Writes the checkpoints of one run directory, in a `with` block.
 
-    A thread writes them while training continues. The newest are kept.
+    A thread writes the checkpoints while training continues. The `KEPT` newest ones are kept.
     """
 
     def __init__(self, run: Path, update: int | None = None) -> None:
         """Opens `run`/checkpoints.
 
-        A resumed run gives the `update` that it continues from. Later checkpoints were skipped as
-        damaged: they are moved to `run`/passed_over.
+        A resumed run gives the `update` that it continues from. Checkpoints of later updates were
+        skipped as damaged, and are moved to `run`/passed_over.
         """
         self._run, self._owner = run, _owner(run)
         self._thread = ThreadPoolExecutor(1)
         self._pending: Future[None] | None = None
         if update is not None and hosts.is_first():
-            for left in (run / FOLDER).glob(_TEMPORARY.format("*")):  # a run was killed
+            for left in (run / FOLDER).glob(_TEMPORARY.format("*")):  # left by a killed run
                 shutil.rmtree(left)
             for step in [step for step in steps(run) if step > update]:
                 aside = run / "passed_over" / str(step)
@@ -102,14 +102,14 @@ class Checkpoints:
                 path_of(run, step).rename(aside)
 
     def save(self, state: Any, update: int, logs: Mapping[str, int] | None = None) -> None:
-        """Begins to write a state.
+        """Starts to write a state in the thread.
 
-        Does nothing if the update is already saved, or if what was learned is not finite.
+        Nothing is written if the update is already saved, or if a learned number is not finite.
 
         Args:
           state: the training state; it is copied before this returns.
-          update: updates that are done.
-          logs: bytes of each log at this update, by name.
+          update: number of updates that are done.
+          logs: length of each log at this update, in bytes, by name.
 
         Raises:
           TrainingError: if the previous checkpoint could not be written.
@@ -154,7 +154,7 @@ class Checkpoints:
         meta |= {"digest": digest(leaves)}
         folder = path_of(self._run, meta["update"])
         temporary = folder.with_name(_TEMPORARY.format(folder.name))
-        shutil.rmtree(temporary, ignore_errors=True)  # of a run that was killed at its first one
+        shutil.rmtree(temporary, ignore_errors=True)  # left by a killed run
         temporary.mkdir(parents=True)
         try:
             with _orbax() as orbax:
@@ -186,7 +186,7 @@ class Checkpoints:
 
 def _orbax() -> Any:
     """Opens a `StandardCheckpointer` that waits for no other process of the run."""
-    import orbax.checkpoint as ocp  # a third of a second, which the saving thread spends
+    import orbax.checkpoint as ocp  # takes a third of a second, here in the saving thread
 
     _silence()
     own = jax.process_index()
@@ -199,9 +199,9 @@ def _orbax() -> Any:
 
 @functools.cache
 def _silence() -> None:
-    """Silences what Orbax says beside our own sentence when a file cannot be written.
+    """Silences Orbax's messages about a file that cannot be written: our own sentence says it.
 
-    It then closes its event loop, but TensorStore still reports the other files to the loop.
+    Orbax then closes its event loop, but TensorStore still reports the other files to this loop.
     """
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -215,7 +215,7 @@ def _silence() -> None:
 
 
 def _why(error: Exception) -> str:
-    """Returns the reason of a failed write; TensorStore gives it at the end of a long text."""
+    """Returns why a write failed; TensorStore gives the reason at the end of a long text."""
     code = re.search(r"os_error_code='(\d+)'", str(error))
     if code:
         return os.strerror(int(code[1]))
@@ -245,7 +245,7 @@ def find(run: Path, update: int | None = None) -> Kept:
 
     Args:
       run: the run directory.
-      update: update of the checkpoint to read; None for the newest.
+      update: update of the checkpoint to read; None for the newest sound checkpoint.
 
     Raises:
       CheckpointError: if there is no sound checkpoint.
@@ -293,7 +293,7 @@ def _check(meta: Mapping[str, Any], step: int, owner: Mapping[str, Any]) -> None
 
 
 def to_leaves(state: Any) -> Leaves:
-    """Flattens a state to named arrays. PRNG keys become their data; empty arrays are dropped."""
+    """Flattens a state to named arrays. PRNG keys become plain data; empty arrays are left out."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -307,7 +307,7 @@ def from_leaves(leaves: Leaves, template: Any) -> Any:
     """Rebuilds a state from its leaves.
 
     Args:
-      leaves: the arrays, as `to_leaves` gave them.
+      leaves: the arrays, as `to_leaves` returns them.
       template: a state of the same structure, or its shapes from `jax.eval_shape`.
 
     Returns:

@@ -1,10 +1,10 @@
-"""Keeps compiled programs between runs, so that a second start need not compile.
+"""Keeps compiled programs between runs, so that a second start need not compile them.
 
 JAX loads and runs the files in the cache directory, so anyone who can write there can run code
 here. Therefore the directory belongs to the user, and a directory that others can write is not
-used. If the environment or a surrounding program has already configured JAX's cache, it is left
-unchanged: `JAX_COMPILATION_CACHE_DIR` chooses another directory, and
-`JAX_ENABLE_COMPILATION_CACHE=false` keeps nothing.
+used. If the environment or a surrounding program has already configured JAX's cache, this
+configuration is left unchanged: `JAX_COMPILATION_CACHE_DIR` chooses another directory, and
+`JAX_ENABLE_COMPILATION_CACHE=false` turns the cache off.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ def _open(directory: Path) -> None:
     """Makes the directory, private to its owner, and checks that it can be used.
 
     Raises:
-      OSError: if it cannot be written, or if others can write it.
+      OSError: if the directory cannot be written, or if other users can write to it.
     """
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=directory).close()

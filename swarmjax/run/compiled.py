@@ -1,4 +1,4 @@
-"""Compiles the program of a run ahead of time, and says how much memory it needs."""
+"""Compiles the program of a run ahead of time, and says how much memory the program needs."""
 
 import time
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from swarmjax.training.rollout import Program
 
 @dataclass(frozen=True)
 class Compiled:
-    """The compiled chunk, the time to compile it, and the memory that it needs.
+    """The compiled function that trains a chunk of updates, with its compile time and memory.
 
     Attributes:
       call: (schedule, state [N], n) -> (state [N], metrics [N, rows]). The state is donated.
@@ -43,11 +43,11 @@ def compile_chunk(
     Args:
       program: the run's program.
       schedule: the curriculum's numbers.
-      state: [N] a state, or its shapes from `jax.eval_shape`.
-      keep_trace: whether to keep the traced program for later runs, and to use a kept one.
+      state: states with a seed axis [N], or their shapes from `jax.eval_shape`.
+      keep_trace: whether to keep the traced program for later runs, and to use one that was kept.
 
     Returns:
-      The program to call.
+      The compiled function, its compile time and its memory.
     """
     began = time.perf_counter()
     groups = programs.groups(program.config, provenance.cores())

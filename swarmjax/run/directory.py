@@ -27,7 +27,7 @@ from swarmjax.run.errors import CheckpointError
 CONFIG, SUMMARY, LOCK = "config.json", "summary.json", ".lock"
 METRICS, DECISIONS, EPISODES = "metrics.jsonl", "curriculum.jsonl", "episodes.jsonl"
 LOGS = (METRICS, DECISIONS, EPISODES)
-# Keys of a stored config that may change when a run is resumed: they do not affect past results.
+# Keys of a stored config that may change when a run is resumed, as they affect no past results.
 MAY_CHANGE = ("budget", "devices", "resume", "run", "streams")
 
 Row = dict[str, Any]
@@ -44,10 +44,11 @@ def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
 
     Args:
       run: the directory.
-      claimed: whether `claim` has made it. What was made is removed if the run writes nothing.
+      claimed: whether `claim` has made the directory. Directories that were made for the run are
+        removed if the run writes nothing.
 
     Raises:
-      ConfigError: if another process is writing the directory, or it cannot be written.
+      ConfigError: if another process is writing the directory, or this process cannot write it.
     """
     made = [path for path in (run, *run.parents) if not path.exists()]
     made = made or [run, run.parent] * claimed
@@ -64,7 +65,7 @@ def locked(run: Path, *, claimed: bool = False) -> Iterator[None]:
 
 
 def _remove_empty(run: Path, made: Iterable[Path]) -> None:
-    """Removes the directories that were made, if the run then wrote nothing."""
+    """Removes the directories that were made for a run, if the run wrote nothing."""
     with contextlib.suppress(OSError):  # already removed, not empty, or owned by another user
         if made and os.listdir(run) == [LOCK]:
             (run / LOCK).unlink()
@@ -73,7 +74,7 @@ def _remove_empty(run: Path, made: Iterable[Path]) -> None:
 
 
 def _lock(run: Path, held: contextlib.ExitStack) -> None:
-    """Locks a run directory, and writes into the lock which process holds it."""
+    """Locks a run directory, and writes into the lock file which process holds the lock."""
     file = held.enter_context((run / LOCK).open("a+"))
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -96,11 +97,11 @@ def claim(folder: Path, name: str) -> Path:
     """Makes a new directory that no other process gets, even if it asks for the same name.
 
     Args:
-      folder: its parent, which is made if it is missing.
-      name: its name; if there is one, the name with -2, -3 and so on.
+      folder: parent of the new directory; it is made if it is missing.
+      name: name of the new directory. If this name is taken, -2, -3 and so on is added.
 
     Raises:
-      OSError: if it cannot be made.
+      OSError: if the directory cannot be made.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
@@ -112,7 +113,7 @@ def claim(folder: Path, name: str) -> Path:
 
 
 def visible(run: Path) -> list[str]:
-    """Lists the names in a directory, without locks and temporary files of a start that was killed.
+    """Lists the names in a directory, leaving out locks and temporary files of a killed start.
 
     Args:
       run: the directory; it need not exist.
@@ -126,10 +127,10 @@ def visible(run: Path) -> list[str]:
 def is_written(run: Path) -> bool | None:
     """Returns whether the process that last wrote a run directory still runs.
 
-    Acquiring the lock as a test would keep out a run that begins at the same moment.
+    This does not try to acquire the lock, which would keep out a run that begins at that moment.
 
     Returns:
-      None if the process ran on another machine.
+      Whether the process still runs; None if it was started on another machine.
     """
     try:
         process, host = (run / LOCK).read_text().splitlines()
@@ -147,7 +148,7 @@ def write_json(path: Path, found: Mapping[str, Any]) -> None:
     """Replaces a JSON file, completely or not at all.
 
     Raises:
-      OSError: if it cannot be written.
+      OSError: if the file cannot be written.
     """
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
@@ -183,7 +184,7 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         """Opens the file, and makes it if it is missing."""
-        # Unbuffered: on a full disk, `close` would fail again on what is left in a buffer.
+        # Unbuffered: on a full disk, `close` would fail again on rows that are left in a buffer.
         self._file = path.open("ab", buffering=0)
 
     def write(self, rows: Iterable[Row]) -> None:
@@ -222,7 +223,7 @@ def cut(path: Path, length: int) -> None:
       length: length in bytes, at the end of a line.
 
     Raises:
-      CheckpointError: if the log is shorter, or no line ends there.
+      CheckpointError: if the log is shorter than `length`, or no line ends at this length.
     """
     if not path.exists():
         return
@@ -242,7 +243,7 @@ def read_rows(path: Path, length: int | None) -> list[Row]:
 
     Args:
       path: the log. A missing log has no rows.
-      length: bytes to read; None for all.
+      length: number of bytes to read; None for the whole log.
 
     Raises:
       CheckpointError: if the log is damaged.

@@ -1,6 +1,6 @@
 """Limits the unused memory that glibc keeps for this process.
 
-glibc gives each thread its own heap, and a heap keeps the memory that was freed. XLA
+glibc gives each thread its own heap, and a heap keeps memory after the thread has freed it. XLA
 starts dozens of threads. So half a gigabyte stays allocated after compiling, and a long
 run seems to leak as its heaps fill up. A single heap is no solution, because compiling threads wait
 for its lock. With one heap on 32 cores, `stage=worlds` with a memory took 145 s to compile instead

@@ -1,8 +1,8 @@
 """Lets several processes train one run, on one or more hosts.
 
-The first process shows the run and writes its directory. The others write into a temporary folder.
-All processes must call the program in step. So they decide together about anything that depends on
-a clock or a signal.
+The first process displays the run and writes the run directory. The other processes write into a
+temporary folder. All processes must make the same calls of the compiled program. So they decide
+together about anything that depends on a clock or a signal.
 """
 
 import contextlib
@@ -24,17 +24,18 @@ from swarmjax.run.errors import LostPeerError
 from swarmjax.run.settings import TrainConfig
 
 CHECKPOINTS = "checkpoints"  # folder in a run directory
-# A missing process is reported within a minute, and a lost one within half a minute.
+# A process that does not join is reported within a minute, and a lost one within half a minute.
 _JOIN_S, _HEARTBEAT_S = 45, 20
 # Keys that may differ between processes, so the comparison replaces their values.
 _OWN = {"run.id": None}
 
 
 def join(settings: TrainConfig) -> None:
-    """Joins the other processes of a run, with `run.distributed`.
+    """Joins the other processes of a run, if `run.distributed` is true.
 
-    JAX finds them as `jax.distributed.initialize` says. It reads `JAX_COORDINATOR_ADDRESS` itself,
-    but not how many processes there are without a cluster's scheduler, and which of them this is.
+    JAX finds the other processes as `jax.distributed.initialize` says. JAX reads
+    `JAX_COORDINATOR_ADDRESS` itself, but not `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID`, which are
+    needed without a cluster's scheduler.
 
     Args:
       settings: the run's config.
@@ -72,7 +73,7 @@ def count() -> int:
 
 
 def is_first() -> bool:
-    """Returns whether this process shows and writes the run."""
+    """Returns whether this process displays the run and writes its directory."""
     return jax.process_index() == 0
 
 
@@ -80,10 +81,10 @@ def share(value: int) -> np.ndarray:
     """Shares one number per process among all processes.
 
     Args:
-      value: the number that this process contributes, 32 bits.
+      value: the integer that this process contributes, 32 bits.
 
     Returns:
-      [P] the numbers of all processes, in order.
+      [P] the integers of all P processes, in the order of the processes.
     """
     if count() == 1:
         return np.array([value])
@@ -121,7 +122,7 @@ def lost_peers() -> Iterator[None]:
     """Replaces JAX's error about a lost process by one sentence.
 
     Raises:
-      LostPeerError: if another process is gone.
+      LostPeerError: if another process of the run is gone.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Makes the settings of a run from its words, and from the directory of a run that goes on."""
+"""Makes a run's settings from command-line words, and for a resumed run also from its directory."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,14 +32,14 @@ NETWORK_KEYS = (
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
     """Makes the configuration that a run directory or a policy holds.
 
-    A file of extensions that it names is left out: only a command line or Python names code.
+    Its key `extensions` is left out: only a command line or Python may name code to execute.
 
     Args:
       stored: the result of `to_dict`.
       where: the prefix of its keys in messages.
 
     Raises:
-      ConfigError: if it is invalid.
+      ConfigError: if the configuration is invalid.
     """
     own = {key: value for key, value in stored.items() if key != "extensions"}
     return build_stored(TrainConfig, own, where)
@@ -55,7 +55,7 @@ def read_config(run: Path) -> dict:
       The config as plain data, unchecked.
 
     Raises:
-      ConfigError: if there is none, or it is not a JSON object.
+      ConfigError: if the directory has no config, or the config is not a JSON object.
     """
     path = run / CONFIG
     check_text("the run directory", str(run))
@@ -74,7 +74,7 @@ def load_train(
 
     Args:
       overrides: the words.
-      stages: plain data of the stages, in place of a file.
+      stages: plain data of the stages; None if the words name the stages.
 
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
@@ -104,7 +104,7 @@ def load_as[C: TrainConfig](
 
 
 def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
-    """Returns the stages of a curriculum along axes, which end at a single stage."""
+    """Returns the stages that `curriculum.axes` makes out of a single stage."""
     if len(stages) > 1:
         raise ConfigError(
             f"curriculum.axes needs one stage, but stage names {len(stages)}: give one, as in "
@@ -121,7 +121,7 @@ def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
 def _inherited(cls: type[TrainConfig], typed: Sequence[str]) -> list[str]:
     """Returns the words that a run with `init_from` takes from the run that it starts from.
 
-    They set robot, task, realism and the shape of the networks. Typed words override them.
+    These words set robot, task, realism and the shape of the networks. Typed words override them.
     """
     source = files.parse(cls, typed).get("init_from")
     if not isinstance(source, str):
@@ -147,7 +147,7 @@ def settle[C: TrainConfig](settings: C) -> C:
     """Adds the full names and digests of the extension pieces that a run uses.
 
     Args:
-      settings: the config. Digests that the config already holds come from a stored run.
+      settings: the config. If it already holds digests, they come from a stored run.
 
     Raises:
       ConfigError: if a piece is missing, or differs from the one that the stored run used.
@@ -178,12 +178,12 @@ def settle[C: TrainConfig](settings: C) -> C:
 
 
 def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainConfig:
-    """Makes the configuration with which a stored run goes on, by default in its own directory.
+    """Makes the configuration with which a stored run goes on in its own directory.
 
-    `run.stop_after` and `run.distributed` are not kept: they say how the stored run was trained.
+    The stored `run.stop_after` and `run.distributed` are dropped: they applied only to that start.
 
     Args:
-      stored: configuration of the run, as `to_dict` gave it.
+      stored: configuration of the run, as `to_dict` returns it.
       overrides: `key=value` words, only for keys that may change.
 
     Raises:
@@ -217,7 +217,7 @@ def _may_change(key: str) -> bool:
 
 
 def _kept_streams(streams: int | None, devices: Any, seeds_by: str) -> int | None:
-    """Returns the random streams of a resumed run: its own, if its devices can share them."""
+    """Returns a resumed run's number of streams: the stored one if its devices can share it."""
     by_seeds = seeds_by == "devices"
     fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
     return streams if fits else None
@@ -230,7 +230,7 @@ def load_run(
 
     Args:
       overrides: `key=value` words; with `resume`, only for keys that may change.
-      stages: plain data of the stages of a new run, in place of a file.
+      stages: plain data of the stages of a new run; None if the words name the stages.
 
     Raises:
       ConfigError: if a word, a choice, a file or a value is invalid.
@@ -245,7 +245,7 @@ def load_run(
 
 
 def _go_on_or_begin(words: Sequence[str], stages: Sequence[dict[str, Any]] | None) -> TrainConfig:
-    """Makes the configuration for `resume=auto`: of the run in `run.dir`, or of a new run there."""
+    """Makes the configuration for `resume=auto`: it resumes the run in `run.dir` or begins one."""
     typed = load_train(words, stages=stages)
     if typed.run.dir is None:
         raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
@@ -264,7 +264,7 @@ def _go_on_or_begin(words: Sequence[str], stages: Sequence[dict[str, Any]] | Non
 
 
 def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Refuses to resume a run with other settings than its own, and names the keys that differ."""
+    """Refuses to resume a run with settings that differ from its own, and names these keys."""
     mine, its = (
         files.flatten({k: v for k, v in each.items() if k not in MAY_CHANGE})
         for each in (typed, stored)

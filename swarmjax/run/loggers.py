@@ -1,8 +1,8 @@
-"""Sends a run's figures to loggers: TensorBoard, W&B and your own.
+"""Sends a run's metrics to loggers: TensorBoard, W&B and your own.
 
 `metrics.jsonl` is the run's own record. This file is written first, checkpoints record its length,
-and a run that cannot write it ends. A logger holds nothing beyond this record, so its failure does
-not end a run.
+and a run that cannot write this file ends. A logger holds nothing beyond this record, so a failure
+of a logger does not end the run.
 """
 
 import queue
@@ -13,18 +13,19 @@ from typing import Protocol, runtime_checkable
 
 from swarmjax.run.directory import Row
 
-PATIENCE_S = 60.0  # how long a run waits at its end for a logger
+PATIENCE_S = 60.0  # seconds that a run waits at its end for a logger
 
 
 @runtime_checkable
 class Logger(Protocol):
-    """A destination for a run's figures.
+    """A destination for a run's metrics.
 
-    - All calls come from one thread of the logger's own, one after the other. `close` is the last.
-    - The rows are those of `metrics.jsonl`, in the order of the updates, with the seeds of an
-      update together. A run that resumes begins with the update after its checkpoint.
-    - If a call raises an error, or the calls have not ended `PATIENCE_S` after the run, the run
-      prints a message and goes on without the logger.
+    - Each logger has its own thread, which makes all calls one after the other. `close` is the last
+      call.
+    - The rows are those of `metrics.jsonl`, sorted by update, then by seed. The first row of a
+      resumed run is that of the update after its checkpoint.
+    - If a call raises an error, or the calls have not ended `PATIENCE_S` seconds after the run's
+      last one, the run prints a message and goes on without the logger.
 
     Attributes:
       name: name of the logger in messages.
@@ -33,11 +34,11 @@ class Logger(Protocol):
     name: str
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Receives the rows of a call. Other loggers read the same rows, so do not change them.
+        """Receives the rows of a call of the program. Do not change them: others read them too.
 
         Args:
           rows: one for each update and seed, as `recorder.rows` makes them.
-          speeds: speeds of the call over all seeds, such as `arena_steps_per_s`.
+          speeds: speeds of the call, summed over all seeds, such as `arena_steps_per_s`.
         """
         ...
 
@@ -50,7 +51,7 @@ class Guarded:
     """Calls a logger in a thread, so that it can neither slow down nor stop the run."""
 
     def __init__(self, logger: Logger) -> None:
-        """Starts the thread, but calls nothing yet."""
+        """Starts the thread, but does not call the logger yet."""
         self._logger, self._is_lost = logger, False
         self._calls: queue.SimpleQueue[tuple[Sequence[Row], Row] | None] = queue.SimpleQueue()
         # A daemon, because at exit Python would wait for other threads, perhaps forever.
@@ -58,11 +59,11 @@ class Guarded:
         self._thread.start()
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Queues the rows of a call."""
+        """Queues the rows of a call of the program for the thread."""
         self._calls.put((rows, speeds))
 
     def close(self) -> None:
-        """Waits until everything is written, for at most `PATIENCE_S`."""
+        """Waits until everything is written, for at most `PATIENCE_S` seconds."""
         self._calls.put(None)
         self._thread.join(PATIENCE_S)
         if self._thread.is_alive():
@@ -82,7 +83,7 @@ class Guarded:
             self._lose(f"{type(error).__name__}: {first}")
 
     def _lose(self, why: str) -> None:
-        """Stops calling the logger, and reports this once."""
+        """Stops calling the logger; the first time, also reports why."""
         if not self._is_lost:
             self._is_lost = True
             sys.stderr.write(f"swarmjax: {self._logger.name} is not written from here on: {why}.\n")

@@ -1,9 +1,9 @@
-"""Refuses a run that does not fit into a device's memory, before it allocates any of it.
+"""Refuses a run that does not fit into a device's memory, before the run allocates any.
 
 A compiled program reports the memory of its arguments, temporaries and results. Results that reuse
-donated arguments do not count. The total grows about linearly with the number of arenas: on a CPU,
-a line through 128 and 256 arenas is less than 0.1 % off at 8,192. Warp's temporary arrays are
-not included, because they lie outside JAX's share of the GPU.
+the memory of donated arguments are left out. The total grows about linearly with the number of
+arenas: on a CPU, a line through the totals of 128 and 256 arenas is less than 0.1 % off at 8,192
+arenas. Warp's temporary arrays are not included, because they lie outside JAX's share of the GPU.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 
 MARGIN = 0.95  # factor on the proportional estimate: part of the memory does not grow with arenas
-# How XLA, CUDA, and Warp through CUDA, report a failed allocation.
+# Words with which XLA, CUDA, and Warp through CUDA report a failed allocation.
 _EXHAUSTED = ("RESOURCE_EXHAUSTED", "OUT_OF_MEMORY", "Failed to allocate")
 
 
@@ -41,10 +41,10 @@ def check(settings: TrainConfig, needed: int) -> None:
 
     Args:
       settings: the run's config.
-      needed: memory of a device that the run takes, bytes.
+      needed: memory of a device that the run needs, bytes.
 
     Raises:
-      ConfigError: if it does not fit. The message names a number of arenas that should fit.
+      ConfigError: if the run does not fit. The message names a number of arenas that should fit.
     """
     available = limit()
     if available is None or needed <= available:

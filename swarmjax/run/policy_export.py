@@ -54,11 +54,11 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
 
     Args:
       trained: the run's config.
-      update: update that the policy comes from, 0 or more.
+      update: number of the update that the policy comes from, at least 0.
       seed: seed of the policy.
 
     Returns:
-      The `meta` of the `policy.npz` format without `format`, in SI units.
+      The `meta` of the `policy.npz` format without its key `format`, in SI units.
     """
     robot = trained.robot
     encoding = resolve_encoding(trained.task, trained.realism)
@@ -97,7 +97,7 @@ def policy_meta(trained: TrainConfig, update: int, seed: int) -> dict:
         "realism": to_dict(trained.realism),
         "stages": [to_dict(stage) for stage in trained.stage],
         "extensions": trained.pieces,
-        # Without what concerns only the machine of the run, such as its paths.
+        # Leaves out keys that concern only the machine of the run, such as paths.
         "config": {k: v for k, v in to_dict(trained).items() if k not in _LOCAL},
         "versions": provenance.versions(),
         "update": update,
@@ -125,7 +125,7 @@ def seed_path(path: Path, trained: TrainConfig, seed: int) -> Path:
 
 
 def _squashed(arrays: dict[str, np.ndarray], algo: AlgoConfig) -> dict[str, np.ndarray]:
-    """Writes a tanh output as one more hidden layer, followed by an identity output layer."""
+    """Turns a tanh output into one more hidden layer, followed by an identity output layer."""
     if algo.mean_activation == "linear":
         return arrays
     parts, count = ("kernel", "bias"), 0 if _has_own_network(algo) else len(algo.hidden_sizes)
@@ -143,7 +143,7 @@ def write_policy(path: Path, leaves: Leaves, trained: TrainConfig, update: int, 
       path: the file.
       leaves: [N, ...] arrays of a run's checkpoint.
       trained: the run's config.
-      update: update of the checkpoint.
+      update: number of the checkpoint's update.
       seed: a seed of the run.
     """
     lane = trained.numbers.index(seed)

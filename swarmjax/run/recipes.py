@@ -10,10 +10,10 @@ from swarmjax.config import ConfigError, Section, files, reading, show
 
 
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
-    """Replaces `recipe=NAME` by the words of the recipe. Typed words override them.
+    """Replaces `recipe=NAME` by the words of the recipe. Typed words override these.
 
-    A recipe may extend another one, which the key `recipe` names. Its own words override the
-    other's.
+    A recipe may extend another recipe, which its key `recipe` names. The words of the extending
+    recipe override those of the other.
 
     Args:
       cls: the command's dataclass.

@@ -29,16 +29,17 @@ def rows(
     Args:
       metrics: [N, rows, ...] as `seeds.chunk` returns them. The first n entries of each seed
         hold one update each.
-      n: updates of the call.
+      n: number of updates of the call.
       stages: names of the stages.
       seeds: [N] seeds of the run.
-      control_steps: control steps of one update and seed, over all arenas.
+      control_steps: control steps of one update and seed, summed over all arenas.
 
     Returns:
       Rows of plain numbers, ordered by update, then by seed. Counts are unchanged. Shares and means
-      are over the episodes that ended on the row's stage in the update; None if none ended.
+      are taken over the episodes that ended on the row's stage in the update. They are None if no
+      episode ended.
     """
-    # [n, N] flattened, so that the seeds of an update are adjacent.
+    # The axes [n, N] are flattened in this order, so that the seeds of an update are adjacent.
     columns = {
         name: np.swapaxes(np.asarray(column)[:, :n], 0, 1).reshape(-1, *column.shape[2:]).tolist()
         for name, column in metrics.items()
@@ -79,7 +80,7 @@ def _share(part: float, whole: float) -> float | None:
 
 
 def speeds(settings: TrainConfig, rows: Sequence[Row], seconds: float) -> dict[str, float]:
-    """Returns a call's speeds per second, over all seeds."""
+    """Returns the speeds of a call, per second and summed over all seeds."""
     rollout = settings.algo.rollout_length
     arena_steps = len(rows) * settings.arenas * rollout
     steps = {
@@ -106,9 +107,9 @@ class Recorder:
 
         Args:
           run: the run directory.
-          logs: bytes of each log at the checkpoint; empty for a run without a checkpoint.
+          logs: length of each log at the checkpoint, in bytes; empty without a checkpoint.
           episodes: whether to log episodes.
-          loggers: receive the rows too, and are closed at the end.
+          loggers: loggers that receive the same rows, and are closed at the end.
         """
         run.mkdir(parents=True, exist_ok=True)
         for name in directory.LOGS:
@@ -130,12 +131,12 @@ class Recorder:
             logger.write(rows, speeds)
 
     def write_episodes(self, rows: Iterable[Row]) -> None:
-        """Writes the episodes of a call, if they are logged."""
+        """Writes the rows of a call's episodes, if the run logs episodes."""
         if EPISODES in self._logs:
             self._logs[EPISODES].write(rows)
 
     def sync(self) -> dict[str, int]:
-        """Flushes all rows to disk, and returns the bytes of each log by name."""
+        """Flushes all rows to disk, and returns the length of each log in bytes, by name."""
         return self._closed | {name: log.sync() for name, log in self._logs.items()}
 
     def __enter__(self) -> "Recorder":

@@ -1,4 +1,4 @@
-"""Writes what a run ends with: a policy for each seed, and `summary.json`."""
+"""Writes the results of a run: a policy for each seed, and `summary.json`."""
 
 import json
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int
     """Writes the policy of every seed.
 
     Raises:
-      TrainingError: if one cannot be written.
+      TrainingError: if a policy cannot be written.
     """
     for seed in settings.numbers:
         try:
@@ -30,31 +30,32 @@ def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int
             raise TrainingError(str(error)) from None
 
 
-# Episodes that decide on `run.stop_at`; 0.95 of so many lies between 0.89 and 0.98 (95 %, exact).
+# Fewest episodes that decide on `run.stop_at`. If 95 of 100 episodes succeed, the exact 95 %
+# confidence interval of the success is 0.89 to 0.98.
 ENOUGH = 100
 
 
 def has_reached(settings: TrainConfig, newest: Sequence[Row]) -> bool:
-    """Returns whether every seed has the success `run.stop_at` on the last stage.
+    """Returns whether every seed has reached the success `run.stop_at` on the last stage.
 
     Args:
       settings: the config.
-      newest: the last row of each seed; empty before the first update.
+      newest: the last row of metrics of each seed; empty before the first update.
     """
     column = {"targets": "success_by_stage", "all": "complete_by_stage"}
     shares = [row[column[settings.curriculum.success]][-1] for row in newest]
     if settings.run.stop_at is None or not shares or None in shares:
         return False
-    # A curriculum may have one arena on the last stage, whose success says nothing.
+    # A curriculum may have only one arena on the last stage; its success says little.
     least = min(ENOUGH, settings.arenas // 2)
     if any(row["episodes_by_stage"][-1] < least for row in newest):
         return False
-    # In float32, as the shares are: 19 of 20 targets are 0.95.
+    # Compared in float32, the type of the shares, so that 19 of 20 targets count as 0.95.
     return bool((np.array(shares, np.float32) >= np.float32(settings.run.stop_at)).all())
 
 
 def is_current(run: Path, updates: int) -> bool:
-    """Returns whether the summary, the last file of a run, says that it ended at this update."""
+    """Returns whether the summary, a run's last file, says that the run ended at this update."""
     try:
         summary = json.loads((run / SUMMARY).read_text())
         return directory.has_ended(summary) and summary["updates"] == updates
@@ -74,9 +75,9 @@ def write_summary(
     Args:
       run: the run directory.
       program: the run's program.
-      updates: updates that every seed has done.
+      updates: number of updates that every seed has done.
       compile_s: seconds spent compiling.
-      stopped_at: `run.stop_at`, if every seed has reached it.
+      stopped_at: `run.stop_at` if every seed has reached it, otherwise None.
     """
     settings, engine = program.config, program.world.physics.engine
     rows = directory.read_rows(run / METRICS, None)

@@ -1,4 +1,4 @@
-"""Handles signals: a run saves and stops at the first one, and stops at once at the second.
+"""Handles signals: at the first signal a run saves and stops, at the second it stops at once.
 
 SIGINT comes from a person and ends the run with code 130. SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP come
 from a scheduler or a lost terminal. They end the run with code 75, so that a job script can requeue
@@ -23,8 +23,8 @@ CODES = {
     signal.SIGUSR2: REQUEUE,
     signal.SIGHUP: REQUEUE,
 }
-# Seconds in which further signals count as the first one. A scheduler sends a signal to a process
-# and to its parent, which passes it on (`rank`).
+# Seconds after the first signal in which further signals count as the same one. A scheduler sends a
+# signal to a process and to its parent (`rank`), which passes the signal on.
 ONE_S = 1.0
 
 
@@ -45,8 +45,8 @@ class Stop:
 
         Args:
           until: time to stop without a signal, on the clock `time.monotonic`.
-          last: whether the process ends after the `with` block. Then everything is saved, and later
-            signals must not change the exit code.
+          last: whether the process ends after the `with` block. Everything is saved by then, and
+            later signals must not change the exit code.
         """
         self.signalled = False
         self.code: int | None = None
@@ -58,7 +58,7 @@ class Stop:
         return self.signalled or time.monotonic() >= self._until
 
     def check(self) -> None:
-        """Raises `StoppedError` if a signal came. For use before there is anything to save."""
+        """Raises `StoppedError` if a signal came. Call it while there is nothing to save."""
         if self.signalled:
             raise StoppedError(
                 "stopped before the first update: nothing was trained, and nothing is lost"
@@ -68,7 +68,7 @@ class Stop:
         """Begins to listen."""
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        # `nohup`, or `&` in a script, has signals ignored. They stay ignored.
+        # `nohup`, or `&` in a script, starts a command that ignores signals. They stay ignored.
         heard = [each for each in CODES if signal.getsignal(each) is not signal.SIG_IGN]
         self._before = {number: signal.signal(number, self._ask) for number in heard}
         self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
@@ -77,7 +77,7 @@ class Stop:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restores the old signal handlers, or ignores signals if the process ends."""
+        """Restores the old signal handlers, or ignores signals if `last` was given."""
         signal.set_wakeup_fd(self._wakeup)
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self._last else handler)
@@ -93,7 +93,7 @@ def _watch(read: int) -> None:
     """Reports the first signal, and ends the process at the second.
 
     Python calls a handler only between its own instructions. A compiled program can run for minutes
-    within one instruction. The bytes of `signal.set_wakeup_fd` arrive at once.
+    within one instruction. The bytes that `signal.set_wakeup_fd` makes Python write arrive at once.
     """
     code, since = None, 0.0
     with os.fdopen(read, "rb", buffering=0) as pipe:

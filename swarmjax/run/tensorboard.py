@@ -8,14 +8,14 @@ from typing import Any
 from swarmjax.run.directory import Row
 
 FOLDER = "tensorboard"
-BOARDS = 16  # most seeds with a folder, because each one keeps three files open
+BOARDS = 16  # most seeds with a folder, because each folder keeps three files open
 
 
 class Boards:
-    """A `Logger` that writes one TensorBoard folder for each seed.
+    """A `Logger` that writes one TensorBoard folder for each of the first `BOARDS` seeds.
 
-    If PyTorch is installed, tensorboardX imports it, which takes seconds. So the import waits for
-    the first rows and happens in the logger's thread.
+    If PyTorch is installed, tensorboardX imports it, which takes seconds. So this
+    class imports tensorboardX only at the first rows, in the logger's thread.
     """
 
     name = "TensorBoard"
@@ -27,9 +27,10 @@ class Boards:
 
         Args:
           run: the run directory.
-          seeds: of the run.
-          stages: names of the stages of its curriculum.
-          purge: arena step from which on TensorBoard hides older events; None: it hides none.
+          seeds: seeds of the run.
+          stages: names of the stages of the run's curriculum.
+          purge: arena step from which on TensorBoard hides events that were written earlier; None
+            hides nothing.
         """
         folder = run / FOLDER
         several = len(seeds) > 1
@@ -38,7 +39,7 @@ class Boards:
         self._writers: dict[int, Any] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Writes rows, and the speeds to the first folder.
+        """Writes each row to the folder of its seed, and the speeds to the first folder.
 
         Writing a row takes a millisecond, as long as an update of a few arenas. So with N folders,
         each folder receives only every N-th update. All folders together then take no more time
@@ -59,8 +60,8 @@ class Boards:
     def _open(self) -> None:
         """Makes the folders and their files.
 
-        The `SummaryWriter` of tensorboardX takes an event for each number. Its `EventsWriter` takes
-        one for a row.
+        The `EventsWriter` of tensorboardX can write a whole row as one event. Its `SummaryWriter`
+        writes one event for each number.
         """
         from tensorboardX.event_file_writer import EventsWriter
 
@@ -83,8 +84,8 @@ def numbers(row: Row, stages: Sequence[str] = ()) -> dict[str, float]:
     """Lists the numbers of a row by name; leaves out what is no number.
 
     Args:
-      row: row of `metrics.jsonl`. A list in it has a number for each stage. The number gets the
-        name of the list, a slash and the name of the stage.
+      row: a row of `metrics.jsonl`. A list in the row has one number for each stage. The name of
+        such a number is the name of the list, a slash and the name of the stage.
       stages: names of the stages.
     """
     flat: dict[str, Any] = {}

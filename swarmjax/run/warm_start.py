@@ -4,8 +4,8 @@ Optimiser, learning rate, curriculum, arenas, keys and counters start fresh. The
 exceptions: a schedule of exploration goes on, and the number of robots that have trained is kept,
 so that a promotion does not copy one learner over another that has already learned.
 
-If the other run has as many seeds, each seed starts from its counterpart. If the other run has one
-seed, all seeds start from that seed.
+If the other run has as many seeds as the new run, each new seed starts from its counterpart. If the
+other run has one seed, all new seeds start from that seed.
 """
 
 from dataclasses import replace
@@ -35,8 +35,8 @@ def read(settings: TrainConfig) -> Kept | None:
       settings: the config of the new run.
 
     Returns:
-      The checkpoint with what is carried over, for each seed of the new run; None without
-      `init_from`.
+      The checkpoint, reduced to the arrays that are carried over, for each seed of the new run;
+      None without `init_from`.
 
     Raises:
       ConfigError: if there is no such checkpoint, or its networks differ from those of the config.
@@ -62,11 +62,11 @@ def read(settings: TrainConfig) -> Kept | None:
 
 
 def carry(source: Kept, state: TrainState, settings: TrainConfig) -> TrainState:
-    """Puts what was learned into the first state of a new run.
+    """Puts what the other run has learned into the first state of a new run.
 
     Args:
-      source: what is carried over, as `read` gave it.
-      state: the first state, as `mesh.init` gave it.
+      source: what is carried over, as `read` returns it.
+      state: the first state, as `mesh.init` returns it.
       settings: the config of the new run.
 
     Raises:
@@ -97,7 +97,7 @@ def _refused(settings: TrainConfig, error: Exception) -> ConfigError:
 
 
 def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
-    """Refuses networks of another shape or number, or with another encoding of observations."""
+    """Refuses a run whose networks differ in shape, number or encoding of observations."""
     given = show(settings.init_from)
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
@@ -122,7 +122,7 @@ def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
 
 
 def _networks(settings: TrainConfig) -> dict[str, str]:
-    """Returns the settings that runs with the same networks share, by key."""
+    """Returns the settings that must be equal in runs with the same networks, by key."""
     algo = settings.algo
     found = {f"algo.{key}": getattr(algo, key) for key in NETWORK_KEYS if key != "network"}
     if algo.policy == "independent":

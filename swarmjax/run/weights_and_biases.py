@@ -1,4 +1,4 @@
-"""Logs to Weights & Biases, one W&B run for each seed. W&B's WANDB_MODE=offline writes files."""
+"""Logs to Weights & Biases, one W&B run per seed. With WANDB_MODE=offline, W&B writes files."""
 
 import importlib
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ from swarmjax.run.tensorboard import BOARDS, numbers
 
 
 def check(settings: TrainConfig) -> None:
-    """Refuses a run that asks for W&B where it is not installed.
+    """Refuses a run that asks for W&B if W&B is not installed.
 
     Raises:
-      ConfigError: if the library is missing.
+      ConfigError: if the library `wandb` is missing.
     """
     # Python imports W&B's data folder `wandb` as a package without code.
     if settings.run.wandb is not None and not hasattr(_wandb(), "init"):
@@ -36,7 +36,7 @@ class WandbRuns:
         self._open: dict[int, Any] = {}
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Writes the numbers of each row, and the speeds of its call."""
+        """Writes the numbers of each row, together with the speeds of the call."""
         self._open = self._open or {k: self._start(k) for k in self._settings.numbers[:BOARDS]}
         for row in rows:
             if row["seed"] in self._open:
@@ -49,7 +49,7 @@ class WandbRuns:
             each.finish()
 
     def _start(self, seed: int) -> Any:
-        """Starts the W&B run of a seed, or continues that of a resumed run."""
+        """Starts the W&B run of a seed, or continues it if the run is resumed."""
         wandb, asked = _wandb(), self._settings.run
         run = wandb.init(
             project=asked.wandb,

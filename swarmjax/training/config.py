@@ -12,14 +12,14 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# By default, each arena gets one waiting episode per this many control steps of a rollout. The
-# shortest episodes of the six stages take 23 steps.
+# By default, each arena gets one waiting episode for every
+# STEPS_PER_EPISODE control steps of a rollout. The shortest episodes of the six stages take 23 steps.
 STEPS_PER_EPISODE = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProgramConfig(Section):
-    """The settings that fix the compiled program; every caller and every file uses them."""
+    """The settings that fix the compiled program. A subclass adds the settings of a command."""
 
     stage: tuple[StageConfig, ...]
     robot: RobotConfig = field(default_factory=RobotConfig)
@@ -38,29 +38,29 @@ class ProgramConfig(Section):
     )
     seeds_by: Literal["vmap", "cores", "devices"] = setting(
         "vmap",
-        "how to train the seeds; vmap: side by side; cores: vmap, in a group for each core of "
-        "a CPU; devices: vmap, in a group for each device",
+        "how to train the seeds; vmap: all seeds side by side; cores: in one group for each core "
+        "of a CPU; devices: in one group for each device; the seeds of a group run side by side",
     )
     arenas: int = setting(128, "arenas simulated at once", 1, 2**20)
     devices: int = setting(
         1,
-        "number of devices that share the arenas of every seed; with seeds_by=devices, they "
+        "number of devices that share the arenas of every seed, or, with seeds_by=devices, that "
         "share the seeds",
         1,
         2**16,
     )
     streams: int | None = setting(
         None,
-        "random streams, a multiple of devices; runs with equal streams draw the same numbers "
-        "on any number of devices; null: devices",
+        "number of random streams, a multiple of devices; runs with as many streams draw the same "
+        "random numbers on any number of devices; null: one for each device that shares the arenas",
         1,
         2**16,
     )
-    budget: int = setting(3_000_000, "control steps of all arenas together", 1, 10**15)
+    budget: int = setting(3_000_000, "control steps to train, summed over all arenas", 1, 10**15)
     levels_per_rollout: int | None = setting(
         None,
-        "levels drawn for each arena before a rollout; an arena that needs more repeats the "
-        "last one, which then counts for no success; null: one for each 32 control steps",
+        "levels drawn for each arena before a rollout; an arena that needs more repeats the last "
+        "level, and no success counts these repeats; null: one for every 32 control steps",
         1,
         1024,
     )
@@ -70,7 +70,7 @@ class ProgramConfig(Section):
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
-        metadata=about("digest of each piece of extensions, by kind and name", derived=True),
+        metadata=about("digest of each part of extensions in use, by kind and name", derived=True),
     )
 
     @property

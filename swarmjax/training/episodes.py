@@ -28,9 +28,9 @@ class EpisodeLog(NamedTuple):
 
     Attributes:
       ended: [] number of episodes, int32; if more than E, the last ones are lost.
-      arena_steps: [E] control steps of all arenas in the update until the episode ended.
-      stage: [E] stage on which the episode began.
-      steps: [E] control steps.
+      arena_steps: [E] control steps of all arenas since the update began, until the episode ended.
+      stage: [E] index of the stage on which the episode began.
+      steps: [E] control steps of the episode.
       robots: [E] outcome for each robot.
     """
 
@@ -42,11 +42,11 @@ class EpisodeLog(NamedTuple):
 
 
 def room(config: ProgramConfig) -> int:
-    """Returns the most episodes of one update and seed that are kept.
+    """Returns how many episodes of one update and seed are kept at most.
 
-    An arena ends the episode under way and the waiting ones. If fewer wait than by default, it
-    repeats the last one, so it has the room of the default. A short step limit ends more episodes.
-    No arena ends more than one episode at each control step.
+    In an update, an arena ends the episode under way and its waiting episodes. If fewer episodes
+    wait than by default, the arena repeats the last one, so it needs as much room as by default. A
+    short step limit ends more episodes. An arena ends at most one episode at each control step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
     usual = max(config.waiting, steps // STEPS_PER_EPISODE, steps // limit)
@@ -54,7 +54,7 @@ def room(config: ProgramConfig) -> int:
 
 
 def rows_of_call(config: ProgramConfig) -> int:
-    """Returns for how many updates of each seed a call may return episodes."""
+    """Returns how many updates of each seed a call may have if it returns their episodes."""
     return max(1, MOST_HELD // (room(config) * config.seeds))
 
 
@@ -72,14 +72,14 @@ def robots(arenas: EnvState) -> Robots:
 
 
 def pack(ended: Ended, size: int) -> EpisodeLog:
-    """Drops the places where no episode ended.
+    """Drops all steps of arenas at which no episode ended.
 
     Args:
       ended: [T, A] counts of ended episodes, with `robots`.
       size: E.
 
     Returns:
-      The episodes, ordered by the step at which they ended, then by arena; the rest is 0.
+      The episodes, ordered by the step at which they ended, then by arena; further entries are 0.
     """
     chex.assert_rank(ended.episodes, 2)
     assert ended.robots is not None
@@ -111,14 +111,14 @@ def rows(
 
     Args:
       log: [N, rows, ...]; the first n rows of each seed hold one update each.
-      updates: [n] numbers of the updates.
+      updates: [n] numbers of the updates, from 0.
       stages: names of the stages.
       seeds: [N] seeds of the run.
-      control_steps: arena control steps of one update and seed, over all arenas.
+      control_steps: control steps of one update and seed, summed over all arenas.
 
     Returns:
-      The rows, sorted by update, then by seed, then by when the episode ended. Also the number of
-      lost episodes.
+      The rows, sorted by update, then by seed, then by the time at which the episode ended. Also
+      the number of lost episodes.
     """
     found, lost = [], 0
     for i, update in enumerate(updates.tolist()):

@@ -1,7 +1,7 @@
 """The compiled training loop: rollout, advantages, PPO update, curriculum, n times.
 
-The number of updates is an argument, so one program serves every chunk size. Any chunk size gives
-the same run.
+A call trains a chunk of n updates. This number is an argument, so one program serves every chunk
+size. The run is the same with any chunk size.
 """
 
 from collections.abc import Iterable
@@ -33,8 +33,8 @@ class TrainState:
     """The complete state of a run: a checkpoint holds exactly this.
 
     Attributes:
-      learners: [L].
-      arenas: [A], packed.
+      learners: [L] the learners.
+      arenas: [A] the arenas, packed.
       curriculum: state of the curriculum.
       key: random key of the next update.
       update: [] number of finished updates, int32.
@@ -53,7 +53,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
     Args:
       program: the compiled program.
       schedule: the curriculum's numbers.
-      seed: [] seed of the run, int32; None: the config's.
+      seed: [] seed of the run, int32; None for the seed of the config.
 
     Returns:
       The state before the first update.
@@ -75,12 +75,12 @@ def train_chunk(
     Args:
       program: the compiled program.
       schedule: the curriculum's numbers.
-      state: state before.
+      state: state before these updates.
       n: [] number of updates, at most `program.rows`, int32.
 
     Returns:
-      The state after, and metrics with a leading axis of `program.rows`: the first n rows hold one
-      update each.
+      The state after these updates, and metrics with a leading axis of `program.rows`: the first n
+      rows hold one update each.
     """
     # Traces the update once, for both the shapes and the loop.
     step = jax.jit(partial(update, program), inline=True)
@@ -100,10 +100,10 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
     Args:
       program: the compiled program.
       schedule: the curriculum's numbers.
-      state: state before.
+      state: state before this update.
 
     Returns:
-      The state after, and the metrics of this update.
+      The state after this update, and its metrics.
     """
     config, shards, before = program.config, program.shards, state.curriculum
     key, level_key, rollout_key, learn_key = jax.random.split(state.key, 4)
@@ -147,16 +147,17 @@ def carry_over(
 ) -> LearnerState:
     """Prepares the learners for the stage that begins with a promotion.
 
-    If each robot has a learner and the swarm grows beyond its largest size so far, the new robots
-    copy the others' learners in turn: parameters, optimiser and normaliser. Then the optimiser and
-    the exploration of all learners are reset or kept, as `config.curriculum` says. Keeping them has
-    no cost.
+    If each robot has a learner and the swarm grows beyond its largest size so far, the learners of
+    the new robots become copies of the other learners, in turn: parameters, optimiser and
+    normaliser. Then the optimiser and the exploration of all learners are reset or kept, as
+    `config.curriculum` says. Nothing is computed if there is nothing to copy or reset.
 
     Args:
-      learners: [L].
+      learners: [L] the learners.
       program: the compiled program.
       before: state of the curriculum before the update.
-      after: and after it. Without a promotion, the learners stay unchanged.
+      after: state of the curriculum after the update. Without a promotion, the learners stay
+        unchanged.
 
     Returns:
       The learners, [L].
@@ -195,7 +196,7 @@ def _draw(
 def _curriculum_metrics(
     config: ProgramConfig, before: CurriculumState, after: CurriculumState
 ) -> Metrics:
-    """Reports the decision, the weights that it set or held, and the record of each stage."""
+    """Reports the decision, the weights after the decision, and the record of each stage."""
     record, stage = after.cohorts.record, before.chosen.stage
     return {
         "decision": after.chosen.reason,
@@ -213,7 +214,7 @@ def _curriculum_metrics(
 
 
 def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
-    """Averages [L] over the learners that had a valid sample."""
+    """Averages metrics [L] over the learners that had a valid sample."""
     learns = shards.any(jnp.any(batch.valid, axis=(1, 2)))
     count = jnp.maximum(jnp.sum(learns), 1)
     return {name: jnp.sum(jnp.where(learns, x, 0.0)) / count for name, x in learned.items()}

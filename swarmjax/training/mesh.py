@@ -1,8 +1,8 @@
-"""A run over several devices: each runs one program, with a share of the arenas or of the seeds.
+"""A run over several devices: each device runs the program on a share of the arenas or seeds.
 
-If devices share the arenas, only the arenas are spread: every device learns and decides the same
-(`Shards`). If devices share the seeds (`seeds_by=devices`), they exchange nothing. With one device
-there is no mesh, and the program is that of `seeds`.
+If devices share the arenas, only the arenas are spread: every device learns and decides the same,
+as `Shards` says. If devices share the seeds (`seeds_by=devices`), they exchange nothing. With one
+device there is no mesh, and the program is the one that `seeds` makes.
 """
 
 from collections.abc import Callable
@@ -60,10 +60,10 @@ def _layout(config: ProgramConfig) -> _Layout:
 
 
 def make(devices: int, axis: str = AXIS) -> Mesh:
-    """Makes the mesh of the first devices that JAX knows, including those of other hosts.
+    """Makes the mesh of the first devices that JAX knows, including devices of other hosts.
 
     Raises:
-      ConfigError: there are fewer devices.
+      ConfigError: JAX knows fewer devices.
     """
     found = jax.device_count()
     if devices > found:
@@ -83,7 +83,7 @@ def init(program: Program) -> Callable[..., TrainState]:
 
     Returns:
       A function from the curriculum's numbers and the seeds [N] to the states [N] before the first
-      update, spread over devices. Without seeds, it takes the config's.
+      update, spread over devices. Called without seeds, it takes the seeds of the config.
     """
     start = partial(seeds.each, partial(loop.init, program))
     given = lanes(program.config)
@@ -134,7 +134,7 @@ def _spread(function: Any, layout: _Layout, given: Any, returned: Any) -> Any:
 
 
 def put(program: Program, state: TrainState) -> TrainState:
-    """Spreads a state over the devices of the program; every process holds the whole state.
+    """Spreads a state over the devices of the program; every process gives the whole state.
 
     Args:
       program: the compiled program.
@@ -152,7 +152,7 @@ def put(program: Program, state: TrainState) -> TrainState:
 
 
 def stepped_together(program: Program, state: TrainState) -> PhysicsState:
-    """Takes out of a state the arenas that this process's first device steps together.
+    """Extracts from a state the arenas that this process's first device steps together.
 
     Args:
       program: the compiled program.
@@ -175,5 +175,5 @@ def _placed(sharding: NamedSharding, x: jax.Array) -> jax.Array:
 
 
 def _without_empty(state: TrainState) -> TrainState:
-    """Replaces arrays without elements: `shard_map` of jaxlib 0.11.2 fails on them."""
+    """Makes arrays without elements anew, because `shard_map` of jaxlib 0.11.2 fails on them."""
     return jax.tree.map(lambda x: x if x.size else jnp.zeros(x.shape, x.dtype), state)

@@ -23,17 +23,18 @@ from swarmjax.training import episodes
 from swarmjax.training.config import ProgramConfig
 from swarmjax.training.rollout import Program
 
-# XLA then runs two iterations of a loop as one, so it need not copy what one iteration passes to
-# the next. A step of 8,192 arenas thus took 542 us instead of 606 us on an H100
+# With this option, XLA runs two iterations of a loop as one, so it need not copy what one iteration
+# passes to the next. A step of 8,192 arenas thus took 542 us instead of 606 us on an H100
 # (docs/performance.md).
 _GPU_OPTIONS = {"xla_gpu_enable_while_loop_unrolling": "WHILE_LOOP_UNROLLING_DOUBLE_BUFFER"}
-# XLA then does not choose kernels by timing them, and uses no kernel that adds in a varying order.
+# With this option, XLA does not choose kernels by timing them, and uses no kernel that adds in a
+# varying order.
 _DETERMINISTIC = {"xla_gpu_deterministic_ops": True}
-MAX_ROWS = 4096  # most updates of a call, over all seeds; longer chunks take several calls
+MAX_ROWS = 4096  # most updates of a call, summed over seeds; longer chunks take several calls
 
 
 def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) -> Program[C]:
-    """Builds the program of an environment that is there already; otherwise as `load`."""
+    """Builds the program as `load` does, but for an environment that exists already."""
     rows = max(1, MAX_ROWS // config.seeds)
     if by_robot:
         rows = min(rows, episodes.rows_of_call(config))
@@ -51,7 +52,7 @@ def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) 
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
-    """Builds the program and the curriculum's numbers; resolves every setting left to `auto`.
+    """Builds the program and the curriculum's numbers; resolves every setting that is `auto`.
 
     Args:
       config: the settings.
@@ -109,7 +110,7 @@ def load_world(config: ProgramConfig) -> World:
 def schedule(config: ProgramConfig) -> Schedule:
     """Computes the curriculum's numbers.
 
-    The stages before the last share `budget_share` of the updates in equal parts.
+    All stages before the last together get the share `budget_share` of the updates, in equal parts.
     """
     options, before = config.curriculum, len(config.stage) - 1
     share = options.budget_share * config.updates / max(before, 1)
@@ -145,10 +146,10 @@ def side_by_side(config: ProgramConfig) -> int:
 
 
 def compiler_options(*, deterministic: bool = False) -> dict[str, str | bool]:
-    """Returns XLA's options for loops like this one on JAX's current device.
+    """Returns XLA's options for the training loop on JAX's current device.
 
     Args:
-      deterministic: Whether a GPU must compute the same bits each time. A CPU always does.
+      deterministic: Whether a GPU must compute the same bits each time. A CPU always does so.
 
     Returns:
       Values of XLA's options, by name.

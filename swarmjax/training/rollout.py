@@ -1,7 +1,7 @@
 """Rollouts: the learners drive many arenas.
 
 Only this module lays arenas and robots out for the learners: [A, R, ...] becomes [L, A, N, ...],
-with N the robots of an arena that one learner drives.
+where N is the number of robots of an arena that one learner drives.
 """
 
 import functools
@@ -35,14 +35,14 @@ class Program[C: ProgramConfig]:
     """The parts that fix the compiled program; `program.py` builds them.
 
     Attributes:
-      config: its settings.
+      config: settings of the program.
       world: the compiled environment.
       ppo: how the learners act and learn.
       curriculum: makes the curriculum with the numbers of a schedule.
       shards: how the arenas are spread over devices.
       by_robot: whether to report each episode robot by robot.
       waiting: episodes that are drawn for each arena before a rollout.
-      rows: most updates of one call.
+      rows: largest number of updates of one call.
     """
 
     config: C
@@ -62,8 +62,8 @@ class Arena(EnvState):
     Attributes:
       stage: [] index of the stage on which the episode began, int32.
       cohort: [] the curriculum's cohort in which the episode began, int32.
-      recall: [R, H] memory of each robot's actor and critic before the observation; () each without
-        memory.
+      recall: memories of each robot's actor and critic before the observation, each [R, H], or ()
+        without memory.
     """
 
     stage: Array
@@ -111,18 +111,18 @@ def draw_starts(
 ) -> Arena:
     """Draws the levels of episodes that wait until their arena is free.
 
-    They are drawn before a rollout, `program.waiting` for each arena, and not at every step. An
-    arena that runs out of them repeats the last level. The repeats train, but count for no cohort:
-    otherwise short episodes would count more often than long ones.
+    The levels are drawn before a rollout, `program.waiting` for each arena, and not at every step.
+    An arena that runs out of levels repeats the last level. The learners also learn from repeats,
+    but no cohort counts them: otherwise short episodes would count more often than long ones.
 
     Args:
       world: the compiled environment.
-      stages: [S].
-      stage: [W, A] stage of the first episode of every arena, of the second, and so on.
-      cohort: [] cohort for which the episodes count, int32.
+      stages: [S] stages of the curriculum.
+      stage: [W, A] index of the stage of each arena's first waiting episode, second, and so on.
+      cohort: [] number of the cohort for which the episodes count, int32.
       key: random key for the levels, consumed.
-      shards: how the arenas are spread over devices; A counts those of this device.
-      memory: [R, H] memory of the robots of an arena as an episode begins.
+      shards: how the arenas are spread over devices; A is the number of arenas on this device.
+      memory: memories of actor and critic as an episode begins, each [R, H], or () without memory.
 
     Returns:
       [W A] waiting episodes, packed.
@@ -145,12 +145,12 @@ def draw_starts(
 def collect(
     program: Program, learners: LearnerState, arenas: Arena, starts: Arena, key: Array
 ) -> tuple[Arena, Trajectory, Ended]:
-    """Drives all arenas for one rollout; an arena whose episode ends begins a waiting one.
+    """Drives all arenas for one rollout; an arena whose episode ends begins a waiting episode.
 
     Args:
       program: the compiled program.
-      learners: [L].
-      arenas: [A], packed.
+      learners: [L] the learners.
+      arenas: [A] the arenas, packed.
       starts: [W A] waiting episodes in the order of `draw_starts`, packed.
       key: random key, consumed; the same on all devices.
 
@@ -177,8 +177,8 @@ def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended
     Args:
       program: the compiled program.
       trajectory: [T, L, A, N, ...].
-      memory: [A, R, H] memory of the arenas before the rollout.
-      ended: [T, A] episodes that ended in it.
+      memory: memories of actor and critic before the rollout, each [A, R, H], or () without memory.
+      ended: [T, A] episodes that ended in the rollout.
 
     Returns:
       [L] batches, each of A groups with T * N samples.
@@ -189,11 +189,11 @@ def batch(program: Program, trajectory: Trajectory, memory: Recall, ended: Ended
 
 
 class _Valued(NamedTuple):
-    """What the critics say of the current observations, [L, A, N, ...].
+    """The critics' outputs for the current observations, [L, A, N, ...].
 
     Attributes:
       value: value of the observation.
-      memory: [.., H] memory of the critic afterwards; () without memory.
+      memory: [.., H] the critic's memory after the observation; () without memory.
       state: [.., P], what the critic sees in addition to the observation; () if nothing.
     """
 
@@ -202,7 +202,7 @@ class _Valued(NamedTuple):
     state: Any
 
 
-# The counts of `Ended` that are one number each.
+# The counts of `Ended` that are one number per arena and step.
 _COUNTS = (
     *("episodes", "stage", "cohort", "targets", "reached", "all_reached"),
     *("steps", "robot_steps", "sensed", "broken"),
@@ -221,7 +221,7 @@ def _step(
     carry: _Carry,
     step: tuple[Array, Array],
 ) -> tuple[_Carry, tuple[Trajectory, _Counts]]:
-    """Runs one control step of all arenas; the first step of a rollout is 1."""
+    """Runs one control step of all arenas; the first step of a rollout has the number 1."""
     (arenas, before, begun), (key, number) = carry, step
     count = before.value.shape[0]
     observation = to_learners(arenas.observation, count)
@@ -274,7 +274,7 @@ def _next(waiting: _Waiting, begun: Array) -> tuple[Arena, _Valued]:
 
 
 def _value(program: Program, learners: LearnerState, arenas: Arena) -> _Valued:
-    """Values the current observations of arenas [A] by the critics."""
+    """Computes the critics' outputs for the current observations of arenas [A]."""
     count, state = jax.tree.leaves(learners)[0].shape[0], ()
     memory = jax.tree.map(lambda x: to_learners(x, count), arenas.recall.critic)
     if program.ppo.sizes.state:
@@ -289,9 +289,9 @@ def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
     """Replaces episodes that are over with waiting ones.
 
     Args:
-      arenas: [A]; their `sim` is the data of the physics.
-      starts: [A], packed.
-      done: [A].
+      arenas: [A] arenas, not packed: their `sim` holds all data of the physics.
+      starts: [A] waiting episodes, packed.
+      done: [A] whether the arena's episode is over.
 
     Returns:
       The arenas; in their `sim`, only the physical state has been replaced.
@@ -302,7 +302,7 @@ def restart[S: EnvState](arenas: S, starts: S, done: Array) -> S:
 
 
 def _pick[Tree](done: Array, yes: Tree, no: Tree) -> Tree:
-    """Chooses by arena; any axes may follow."""
+    """Takes `yes` where `done` is true, otherwise `no`; their arrays may have further axes."""
 
     def pick(a: Array, b: Array) -> Array:
         return jnp.where(done.reshape(done.shape + (1,) * (b.ndim - done.ndim)), a, b)

@@ -1,8 +1,8 @@
 """Several seeds of a run in one program: `loop` with a leading axis N on state and metrics.
 
 Each seed is a whole run with its own networks, arenas and curriculum, and seeds exchange nothing.
-Seed k is `config.seed + k`. A single seed has the axis too, so that there is one format of state,
-checkpoint and metrics.
+Seed k is `config.seed + k`. A run of a single seed has this axis too, so that there is one
+format of state, checkpoint and metrics.
 """
 
 from collections.abc import Callable
@@ -27,15 +27,16 @@ def chunk(program: Program) -> Callable[[Schedule, TrainState, Array], tuple[Tra
 def each(function: Callable[..., Any], schedule: Any, lanes: Any, *rest: Any) -> Any:
     """Applies a function of one seed to all seeds of a call, side by side.
 
-    The matrix products are then batched. This rounds differently from a run of one seed, but in the
-    same way for every seed. One seed alone is not batched. With `seeds_by=cores`, a call has one
-    group of seeds; with `devices`, it has the seeds of one device.
+    The matrix products of several seeds are batched. Batched products round differently from those
+    of a run of one seed, but in the same way for every seed. One seed alone is not batched.
+    With `seeds_by=cores`, a call has one group of seeds; with `devices`, a call has the seeds of
+    one device.
 
     Args:
-      function: from `schedule`, one lane and `rest` to a tree.
+      function: takes `schedule`, one seed's part of `lanes`, and `rest`; returns a tree.
       schedule: the function's first argument, the same for all seeds.
-      lanes: its second argument with a leading axis N.
-      *rest: its other arguments, the same for all seeds.
+      lanes: the function's second argument, with a leading axis N.
+      *rest: the function's other arguments, the same for all seeds.
 
     Returns:
       The function's results with a leading axis N.

@@ -1,7 +1,7 @@
 """A kernel that takes samples through a network and a loss, and gradients back, on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
-keeps the activations of a tile of samples on the chip. At its end it writes only its sums.
+keeps the activations of a tile of samples on the chip. A program writes only sums, when it ends.
 Programs share nothing, so the same samples give the same bits. A network is one vector, and so is
 its gradient: the optimiser then handles one array instead of a dozen.
 
