@@ -76,8 +76,7 @@ class CurriculumConfig(Section):
         "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep",
-        "exploration after a promotion; reset: begin at algo.initial_std [sequential, mixed]",
+        "keep", "exploration after a promotion; reset: from algo.initial_std [sequential, mixed]"
     )
 
     def _check(self) -> None:
