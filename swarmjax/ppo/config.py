@@ -93,7 +93,9 @@ class AlgoConfig(Section):
     max_grad_norm: float | None = setting(
         0.5, "norm at which gradients are clipped; null: no clipping", above=0.0
     )
-    value_cost: float = setting(0.5, "weight of the value loss, half the mean squared error", 0.0)
+    value_cost: float = setting(
+        0.5, "weight of the value loss, which is half the mean squared error", 0.0
+    )
     entropy_cost: float = setting(0.0, "weight of the entropy bonus", 0.0)
     update_backend: Literal["auto", "autodiff"] = setting(
         "auto",

@@ -30,7 +30,7 @@ GUESS_COST = 0.02
 
 
 class Learning(NamedTuple):
-    """What every way of computing an update uses.
+    """Code that all ways of computing an update share.
 
     Attributes:
       config: settings of PPO.

@@ -144,7 +144,7 @@ def _readings(
 
 
 def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
-    """Lists the ways to find where success becomes steady, one for each reading of success.
+    """Lists the ways to find the step from which success is steady, one per definition of it.
 
     Args:
       stage: uses only the episodes of this stage; None for all.

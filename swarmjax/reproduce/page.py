@@ -49,7 +49,7 @@ def write(out: Path) -> Path:
 def _page(
     data: Reproduction, figures: Mapping[str, bytes], lacks: Mapping[str, Sequence[str]]
 ) -> str:
-    """Lays out the page, from PNG files by name and lists of the arms that each figure lacks."""
+    """Lays out the page from its PNG files, and says for each figure which arms it lacks."""
     verdicts = [claims.verdict(data, claim) for claim in claims.CLAIMS]
     outcomes = [each.outcome for each in verdicts]
     places = [

@@ -38,7 +38,7 @@ class RunConfig(Section):
     episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")
     distributed: bool = setting(
         False,
-        "train with other processes; Slurm, Open MPI or Kubernetes names them, or "
+        "train with other processes, which Slurm, Open MPI or Kubernetes names; elsewhere set "
         "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID",
     )
     deterministic: bool = setting(False, "make results on a GPU bit-for-bit repeatable; slower")

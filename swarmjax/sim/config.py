@@ -190,7 +190,7 @@ class SimConfig(Section):
         None, "robots to compile for; null: 5, or as many as the stages need", 1, 1024
     )
     max_obstacles: int | None = setting(
-        None, "obstacles to compile for; null: 4, or as many as the stages need", 0, 256
+        None, "obstacles to compile for; null: as many as the stages need, at least 4", 0, 256
     )
     substeps: int | None = setting(
         None, "physics steps per control step; null: the body's default", 1, 1000

@@ -181,7 +181,7 @@ def _fixture_names(size: ArenaSize) -> list[str]:
 
 
 def _rubbing(friction: float) -> dict[str, Any]:
-    """Returns hull contact options: condim 1 slides, condim 3 has Coulomb friction on the face."""
+    """Returns contact options of the hull: without friction (condim 1) or with Coulomb friction (3)."""
     if friction == 0.0:
         return {"condim": 1}
     return {"condim": 3, "friction": [friction, friction, *SPIN]}

@@ -65,9 +65,9 @@ class WarpArena:
 
     Attributes:
       place: [R] x, y (m), yaw (rad).
-      rate: [R] velocity of `place`, 1/s.
-      free: [R] acceleration of `place` without contacts, 1/s^2.
-      before: [R] acceleration of `place` in the previous step, 1/s^2.
+      rate: [R] time derivative of `place`, m/s and rad/s.
+      free: [R] second derivative of `place` without contacts, m/s^2 and rad/s^2.
+      before: [R] second derivative of `place` in the previous step, m/s^2 and rad/s^2.
       body: [R] 1 / mass, inverse weight, 1 / moment of inertia.
       side: side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
