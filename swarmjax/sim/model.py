@@ -181,7 +181,7 @@ def _fixture_names(size: ArenaSize) -> list[str]:
 
 
 def _rubbing(friction: float) -> dict[str, Any]:
-    """Returns contact options of the hull: without friction (condim 1) or with Coulomb friction (3)."""
+    """Returns contact options of a hull: frictionless (condim 1), or with Coulomb friction (3)."""
     if friction == 0.0:
         return {"condim": 1}
     return {"condim": 3, "friction": [friction, friction, *SPIN]}

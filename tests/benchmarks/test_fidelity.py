@@ -172,9 +172,9 @@ ROWS = [
 
 
 def test_the_table_has_a_part_for_each_section() -> None:
-    console = Console(file=io.StringIO(), width=80)
-    fidelity.print_table(ROWS, console)
-    assert [line.split() for line in console.file.getvalue().splitlines()] == [
+    text = io.StringIO()
+    fidelity.print_table(ROWS, Console(file=text, width=80))
+    assert [line.split() for line in text.getvalue().splitlines()] == [
         ["quantity", "unit", "theirs", "source", "planar", "wheeled", "error"],
         *(["One"], ["q", "m", "2", "a", "1", "50.00", "%"]),
         *(["Two"], ["r", "1", "b", "0", "12.346"]),

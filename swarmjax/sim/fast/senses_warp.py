@@ -61,7 +61,7 @@ def _look(
 
 
 def _with_last(sensor: infrared.Ray, *last: float) -> Array:
-    """Joins the sensors and the last row of `WarpLook.sensor` into one [A or 1, R or 1, K + 1, 4]."""
+    """Joins the sensors and the last row of `WarpLook.sensor` into [A or 1, R or 1, K + 1, 4]."""
     rows = jnp.stack(jnp.broadcast_arrays(*sensor), axis=-1)
     rows = rows.reshape(*(1, 1, *rows.shape)[-4:])
     row = np.broadcast_to(np.array([*last, 0.0], np.float32), (*rows.shape[:2], 1, 4))
