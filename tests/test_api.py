@@ -175,7 +175,7 @@ def test_64_bits_are_refused_in_one_sentence(
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: swarmjax.make_env("s7"), r"^stage is 's7': give s6, the nearest, or"),
+        (lambda: swarmjax.make_env("s7"), r"^stage is 's7': give s6 \(the most similar name\) or"),
         (lambda: swarmjax.make_env("s3", robot={"hull_radius": -1}), r"^robot\.hull_radius is -1: "
         ""),
         (lambda: swarmjax.make_env("s3", robot="legs"), r"^robot is 'legs': give one of khepera4"),

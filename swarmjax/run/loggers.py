@@ -85,4 +85,4 @@ class Guarded:
         """Stops calling the logger, and reports this once."""
         if not self._is_lost:
             self._is_lost = True
-            sys.stderr.write(f"swarmjax: {self._logger.name} is not written from here on: {why}.\n")
+            sys.stderr.write(f"swarmjax: {self._logger.name} gets no more data: {why}.\n")

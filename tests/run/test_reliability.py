@@ -304,7 +304,7 @@ def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
 
 
 def test_auto_needs_a_directory() -> None:
-    with pytest.raises(ConfigError, match=r"resume is auto, but there is no run\.dir: give"):
+    with pytest.raises(ConfigError, match=r"resume is auto, but run\.dir is missing: give"):
         load_run([*TINY, "resume=auto"])
 
 
@@ -320,7 +320,7 @@ def test_a_log_that_was_cut_is_refused_with_what_to_do(lost: str, tmp_path: Path
     run = _stopped(tmp_path / "run", after=5)
     text = (run / "metrics.jsonl").read_text()
     (run / "metrics.jsonl").write_text(text[: len(text) // 2])
-    with pytest.raises(ValueError, match="put the file back, or delete it to go on"):
+    with pytest.raises(ValueError, match="restore the file, or delete it to continue"):
         train.main([f"resume={run}"])
     (run / "metrics.jsonl").unlink()
     assert train.main([f"resume={run}"]) == 0
