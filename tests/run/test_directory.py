@@ -37,7 +37,9 @@ def test_a_second_process_is_refused_until_the_first_is_dead(tmp_path: Path) -> 
         assert holder.stdout.readline() == "held\n"
         try:
             with (
-                pytest.raises(ConfigError, match=f"but process {holder.pid} is writing to it: wait"),
+                pytest.raises(
+                    ConfigError, match=f"but process {holder.pid} is writing to it: wait"
+                ),
                 directory.locked(run),
             ):
                 pass
@@ -92,7 +94,9 @@ def test_a_log_that_was_deleted_is_begun_anew(tmp_path: Path) -> None:
 def test_a_damaged_line_is_named(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b'{"update": 0}\n' + line + b"\n")
-    with pytest.raises(CheckpointError, match=r"metrics.jsonl is damaged at line 2: restore the file"):
+    with pytest.raises(
+        CheckpointError, match=r"metrics.jsonl is damaged at line 2: restore the file"
+    ):
         directory.read_rows(path, None)
 
 

@@ -173,7 +173,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage.sequence=[curriculum]"], "stage.sequence is curriculum, a curriculum of "
          "several stages: list single stages."),
         (["stage.sequence=[{robots: 2, side: 1}]"], "stage.name is missing and has "
-         "no default: give it."),
+         "no default: give it a value."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
          "robots, side, distance, obstacles, obstacle_size, level, layout, map, cell, breadth, "
          "gap, width, depth, length, radius, apart, cells."),

@@ -147,7 +147,7 @@ def test_a_map_goes_with_its_level(given: dict) -> None:
 )
 def test_refuses_areas_without_room(text: str, robots: int, where: str) -> None:
     said = refusal(room.check, [_stage(text, robots)], SPACING)
-    assert said.startswith(f"stage drawn: level=map has no room for {robots} robots, because robot ")
+    assert said.startswith(f"stage drawn: level=map has no room for {robots} robots, because ")
     assert said.endswith(
         f" overlaps another robot where it {where}: give fewer robots, or more space."
     )
