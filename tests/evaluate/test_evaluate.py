@@ -353,7 +353,7 @@ def wrong(tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         (["policy=none.npz"], "none.npz "),
-        (["policy=no*.npz"], "policy is 'no*.npz', and 'no*.npz' matches no "),
+        (["policy=no*.npz"], "policy is 'no*.npz', but no file matches 'no*.npz'"),
         (["policy=policy.npz,p*.npz"], "policy is "),
         (
             ["policy=policy.npz", "stage=s7"],
@@ -428,5 +428,5 @@ def test_a_comparison_takes_as_many_policies_of_either_recipe(
     monkeypatch.chdir(tmp_path)
     assert _command(monkeypatch, "compare=policy.npz,*e*.npz", "stage=s1", "episodes=1") == 2
     printed = capsys.readouterr().err
-    assert "compare is 'policy.npz,*e*.npz', with 1 and 3 policies: give the same " in printed
+    assert "compare is 'policy.npz,*e*.npz', which names 1 and 3 policies: give as many " in printed
     assert printed.count("\n") == 1

@@ -151,7 +151,7 @@ def test_export_refuses(
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
         (given, "format=c", "out=."): "out is ., which does not end with a name: add the name of ",
         (given, "format=webots", "out=a/.."): "out is a/.., which does not end with a name: add ",
-        ("policy=none.npz", "format=c"): "none.npz is no file: give the path of a policy.npz.",
+        ("policy=none.npz", "format=c"): "none.npz is not a file: give the path of a policy.npz.",
     }.items():
         assert sentence in _refusal(monkeypatch, capsys, *words)
     assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", "file"}

@@ -307,7 +307,7 @@ def test_a_control_step_that_webots_cannot_have_is_refused(tmp_path: Path) -> No
     [
         (["goal=1,2"], {}, r"'goal=1,2' cannot be read: give target=x,y, robot=i or action=mean\."),
         (["target=1"], {}, r"'target=1' cannot be read: give target=x,y, robot=i or action=mean\."),
-        ([], {"missing": ["gps"]}, r"the robot has no device 'gps': .* turretSlot .*\."),
+        ([], {"missing": ["gps"]}, r"the robot has no device 'gps': .* turretSlot\."),
         ([], {"basic": 20.0}, r"basicTimeStep is 20 ms: give 32 ms, .*\."),
         ([], {"basic": 64.0}, r"basicTimeStep is 64 ms: give 32 ms, .*\."),
         (["target=1,2", "robot=3"], {}, r"4 robots are too many: the policy has 3 networks\."),

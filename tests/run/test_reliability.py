@@ -298,8 +298,8 @@ def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
     words = [*TINY, f"run.dir={whole}", "resume=auto", "algo.discount=0.9", "seed=3"]
     with pytest.raises(ConfigError) as error:
         load_run(words)
-    assert "algo.discount is 0.9 and not 0.998" in str(error.value)
-    assert "seed is 3 and not 0" in str(error.value)
+    assert "algo.discount is 0.9, not 0.998" in str(error.value)
+    assert "seed is 3, not 0" in str(error.value)
     assert "may change only budget, devices, resume, run.*, streams" in str(error.value)
 
 

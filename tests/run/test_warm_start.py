@@ -291,7 +291,7 @@ def test_a_run_that_remembers_names_the_memory_that_it_has(
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
     said = _refusal(capsys, monkeypatch, *TINY[:4], "arenas=8", "init_from=.", word)
-    assert said.startswith("init_from is '.', whose ")
+    assert said.startswith("init_from is '.', a run with ")
     assert "memory_size is 64, but memory is none" not in said
 
 
@@ -347,7 +347,7 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     (tmp_path / "checkpoints").symlink_to(trained / "checkpoints")
     words = [f"init_from={tmp_path}", "algo.hidden_sizes=[16]", f"run.dir={tmp_path / 'new'}"]
     sentence = _refusal(capsys, monkeypatch, *TINY, *words)
-    assert sentence.startswith(f"init_from is '{tmp_path}': it takes the directory of a run with")
+    assert sentence.startswith(f"init_from is '{tmp_path}', which must be the directory of a run")
     assert sentence.endswith("cannot be used (it was written with another config.json).")
 
 

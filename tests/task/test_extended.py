@@ -152,7 +152,7 @@ def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
         sentence = refusal(partial(task_world.load, sim=SIM, task=TaskConfig(**task)), stages)
         assert sentence == (
             f"{key}which is not part of swarmjax: add extensions=FILE, the Python file that "
-            "defines "
+            "defines 'x'."
         )
 
 
