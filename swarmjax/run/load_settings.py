@@ -274,5 +274,5 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
         shown = ", ".join(f"{k} is {show(mine[k])}, not {show(its.get(k))}" for k in changed[:3])
         raise ConfigError(
             f"resume is auto, but {run} holds a run with other settings: {shown}; only "
-            f"{', '.join(_RESUME_KEYS)} may change, so use its settings or another run.dir."
+            f"{', '.join(_RESUME_KEYS)} may change, so use that run's settings or another run.dir."
         )

@@ -300,7 +300,7 @@ def test_auto_refuses_other_settings_key_by_key(whole: Path) -> None:
         load_run(words)
     assert "algo.discount is 0.9, not 0.998" in str(error.value)
     assert "seed is 3, not 0" in str(error.value)
-    assert "may change only budget, devices, resume, run.*, streams" in str(error.value)
+    assert "only budget, devices, resume, run.*, streams" in str(error.value)
 
 
 def test_auto_needs_a_directory() -> None:
