@@ -17,8 +17,8 @@ from swarmjax.policy import PolicyError
 
 HELP = {"-h", "--help"}
 _LOST_WORKER = (
-    "a worker process died before its work was done, perhaps because memory ran out: give fewer, "
-    "as in workers=1."
+    "a worker process died before its work was done, perhaps because memory ran out: give fewer "
+    "workers, as in workers=1."
 )
 _ALL = "all"  # the help topic that lists every key
 
@@ -158,7 +158,7 @@ def _overview(cls: type[Section], module: str) -> list[str]:
     top = [key for key in section.keys(cls) if "." not in key]
     blocks = (
         _examples(module),
-        ["Groups, each a folder of configs/:", *files.describe_groups(cls)],
+        ["Groups of files, each a folder of configs/:", *files.describe_groups(cls)],
         ["Keys, with their defaults:", *section.describe_keys(cls, top)],
         [f"Sections of keys; {command} --help all lists all keys:", *_describe_sections(cls)],
     )

@@ -239,8 +239,8 @@ def load(source: str | None) -> Extensions:
     if source.startswith(_HANDED):
         if source not in _loaded:
             raise ConfigError(
-                f"extensions is {source}, which stands for pieces that were defined only in a "
-                "Python program: put them into a file and give extensions=FILE."
+                f"extensions is {source}, which stands for pieces that only a Python program "
+                "defined: put these pieces into a file, and give extensions=FILE."
             )
         return _loaded[source]
     path = Path(source)
@@ -285,7 +285,7 @@ def _import(path: Path, content: bytes, digest: str) -> types.ModuleType:
         # Do not use cached bytecode or lines. Both caches may be out of date, since they compare
         # only a file's size and its modification time in whole seconds.
         linecache.cache.pop(str(path), None)
-        with explained(f"{path} does not import"):
+        with explained(f"{path} cannot be imported"):
             exec(compile(content, str(path), "exec"), vars(module))
     except BaseException:
         del sys.modules[module.__name__]
@@ -318,11 +318,11 @@ def collect(pieces: Iterable[object], where: str) -> Extensions:
             )
         _check(piece, where)
         if piece.name in by_kind[piece.kind]:
-            raise ConfigError(f"{where}: {piece.kind} {piece.name} is there twice: rename one.")
+            raise ConfigError(f"{where}: {piece.kind} {piece.name} is defined twice: rename one.")
         by_kind[piece.kind][piece.name] = piece
     if not any(by_kind.values()):
         raise ConfigError(
-            f"{where} holds no piece: put a decorator of swarmjax.extension before a function."
+            f"{where} defines no piece: put a decorator of swarmjax.extension before a function."
         )
     return Extensions(*(tuple(each.values()) for each in by_kind.values()))
 
@@ -331,11 +331,11 @@ def _check(piece: Piece, where: str) -> None:
     label = f"{where}: {piece.kind} {piece.name}"
     if not isinstance(piece.name, str) or not _NAME.fullmatch(piece.name):
         raise ConfigError(
-            f"{label} is not a valid name: give 1 to 40 lower-case letters, digits and _, a letter "
-            "first."
+            f"{label} does not have a valid name: give 1 to 40 lower-case letters, digits or _, "
+            "beginning with a letter."
         )
     if piece.name in TAKEN[piece.kind]:
-        raise ConfigError(f"{label} is the name of a built-in {piece.kind}: rename it.")
+        raise ConfigError(f"{label} has the name of a built-in {piece.kind}: give it another name.")
     for key in ("weight", "offset", "scale"):
         value = getattr(piece, key, 0.0)
         if type(value) not in (int, float) or not abs(value) <= _LARGEST:
@@ -343,7 +343,7 @@ def _check(piece: Piece, where: str) -> None:
     if isinstance(piece, Observation) and (type(piece.size) is not int or piece.size < 1):
         raise ConfigError(f"{label} has size {show(piece.size)}: give a whole number, 1 or more.")
     if isinstance(piece, Observation) and not piece.scale:
-        raise ConfigError(f"{label} has scale 0, by which values are divided: give another number.")
+        raise ConfigError(f"{label} has scale 0, but scale is a divisor: give another number.")
 
 
 # Digests
@@ -359,7 +359,7 @@ def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
     except (OSError, TypeError, SyntaxError):
         raise ConfigError(
-            f"{getattr(thing, '__name__', thing)} has no source that can be read: define it in a "
+            f"the source of {getattr(thing, '__name__', thing)} cannot be read: define it in a "
             "file or a notebook."
         ) from None
     for node in ast.walk(tree):
@@ -410,5 +410,5 @@ def check_needs(
             holds = "no such piece" if there is None else f"one of digest {there[:12]}"
             raise ConfigError(
                 f"{where} was trained with the {kind} {name} of digest {digest[:12]}, but "
-                f"extensions holds {holds}: give extensions=FILE, the file of its training."
+                f"extensions has {holds}: give extensions=FILE, the file of that training."
             )

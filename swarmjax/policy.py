@@ -72,7 +72,7 @@ def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]
     """Returns a file's arrays, the JSON text of its `meta`, and its digest. Checks the digest."""
     with _one_sentence(path):
         if isinstance(path, str | Path) and Path(path).exists() and not Path(path).is_file():
-            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
+            raise ValueError("it is not a regular file")  # reading a pipe would wait for its writer
         with open(path, "rb") if isinstance(path, str | Path) else nullcontext(path) as file:
             arrays = unpack(file)
         said, text = _text(arrays, "digest"), _text(arrays, "meta")
@@ -80,7 +80,7 @@ def read(path: str | Path | IO[bytes]) -> tuple[dict[str, np.ndarray], str, str]
             raise ValueError(f"meta has more than {MAX_ENTRIES} entries")
         del arrays["digest"]
         if said != digest(arrays):
-            raise ValueError("its digest is not that of its arrays: it was changed or damaged")
+            raise ValueError("its digest and its arrays do not match: it was changed or damaged")
         del arrays["meta"]
         return arrays, text, said
 
@@ -121,7 +121,7 @@ def unpack(file: IO[bytes]) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(file) as archive:  # reads the whole list
         members, size = archive.infolist(), file.seek(0, 2)
         if size > MAX_BYTES or sum(member.file_size for member in members) > size:
-            raise ValueError(f"it unpacks to more than the file, or {MAX_BYTES} bytes")
+            raise ValueError(f"it unpacks to more than its size, or to over {MAX_BYTES} bytes")
         plain = {x.filename for x in members if not (x.compress_type or x.flag_bits & 1)}
         if len(plain) < len(members) or not all(name.endswith(".npy") for name in plain):
             raise ValueError("a member is compressed, encrypted, duplicated or no .npy file")
@@ -140,7 +140,7 @@ def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
                 raise ValueError
             return np.frombuffer(file.read(), dtype).reshape(shape)
         except ValueError:  # NumPy raises it too, for a damaged header
-            raise ValueError(f"{member.filename!r} is not the array that its header says") from None
+            raise ValueError(f"{member.filename!r} does not match its header") from None
 
 
 def _text(arrays: dict[str, np.ndarray], name: str) -> str:
@@ -171,7 +171,7 @@ def act(policy: Policy, observation: np.ndarray, normal: Any = 0.0) -> np.ndarra
       [..., R, U] float32. -1..1 spans the range of commands, but actions may lie beyond it.
     """
     if policy.carried:
-        raise PolicyError("the policy has a memory: call `begin` once an episode, then `step`.")
+        raise PolicyError("the policy has a memory: use `begin` and `step` in place of `act`.")
     return step(policy, None, observation, normal)[1]
 
 
@@ -218,7 +218,7 @@ def _check(policy: Policy, memory: Any, observation: Any) -> None:
     """Refuses arguments of `step` with wrong shapes."""
     robots, (learners, size) = observation.shape[-2], policy.mean.shape
     if robots > learners and not policy.is_shared:
-        raise PolicyError(f"{robots} robots are too many for {learners} independent policies.")
+        raise PolicyError(f"{robots} robots are too many: the policy has {learners} networks.")
     if observation.shape[-1] != size:
         raise PolicyError(f"observation has {observation.shape[-1]} entries: give {size}.")
     expected = begin(policy, observation.shape[:-1])

@@ -175,15 +175,15 @@ def test_64_bits_are_refused_in_one_sentence(
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: swarmjax.make_env("s7"), r"^stage is 's7': give s6, the nearest, or"),
+        (lambda: swarmjax.make_env("s7"), r"^stage is 's7': give s6 \(the most similar name\) or"),
         (lambda: swarmjax.make_env("s3", robot={"hull_radius": -1}), r"^robot\.hull_radius is -1: "
         ""),
         (lambda: swarmjax.make_env("s3", robot="legs"), r"^robot is 'legs': give one of khepera4"),
         (lambda: swarmjax.make_env("s3", arenas=0), r"^arenas is 0: give 1 to 1048576"),
         (lambda: swarmjax.make_env("s3", extensions="no.py"), r"^extensions is 'no.py', but no"),
         (lambda: swarmjax.train_policy({"algo.hidden": [8]}), r"^algo\.hidden is not a key: did y"),
-        (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is no file: give the path of a po"),
-        (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is no file: give the path of a policy"),
+        (lambda: swarmjax.evaluate_policy("no.npz"), r"^no\.npz is not a file: give the path of "),
+        (lambda: swarmjax.load_policy("no.npz"), r"^no\.npz is not a file: give the path of "),
     ],
 )  # fmt: skip
 def test_errors_are_one_class_with_the_sentences_of_the_commands(call, sentence: str) -> None:

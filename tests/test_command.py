@@ -127,5 +127,5 @@ def test_a_worker_that_was_killed_is_one_sentence(
     assert command.run("evaluate", evaluate.main, EvaluateConfig) == 1
     assert capsys.readouterr().err.endswith(
         "swarmjax.evaluate: error: a worker process died before its work was done, perhaps because "
-        "memory ran out: give fewer, as in workers=1.\n"
+        "memory ran out: give fewer workers, as in workers=1.\n"
     )

@@ -75,21 +75,21 @@ def test_an_edited_file_is_read_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "sentence"),
     [
-        ("x = 1", r"a\.py holds no piece: put a decorator of swarmjax\.extension before a "
+        ("x = 1", r"a\.py defines no piece: put a decorator of swarmjax\.extension before a "
         "function"),
-        ("import nowhere_to_be_found", r"a\.py does not import: ModuleNotFoundError: No module"),
-        ("def broken(:", r"a\.py does not import: SyntaxError: "),
-        ("1 / 0", r"a\.py does not import: ZeroDivisionError: division by zero"),
+        ("import nowhere_to_be_found", r"a\.py cannot be imported: ModuleNotFoundError: No module"),
+        ("def broken(:", r"a\.py cannot be imported: SyntaxError: "),
+        ("1 / 0", r"a\.py cannot be imported: ZeroDivisionError: division by zero"),
         (TERM + TERM.replace("def speed", "def again").replace("0.5)", "0.5, name='speed')"),
-         r"a\.py: reward speed is there twice: rename one"),
+         r"a\.py: reward speed is defined twice: rename one"),
         (TERM.replace("def speed", "def progress"),
-         r"a\.py: reward progress is the name of a built-in reward: rename it"),
+         r"a\.py: reward progress has the name of a built-in reward: give it another name"),
         (TERM.replace("def speed", "def Speed"),
-         r"a\.py: reward Speed is not a valid name: give 1 to 40 lower-case letters"),
+         r"a\.py: reward Speed does not have a valid name: give 1 to 40 lower-case letters"),
         ("@observation(size=0)\ndef a(view): return 0", r"observation a has size 0: "),
-        ("@observation(scale=0)\ndef a(view): return 0", r"observation a has scale 0, by "),
+        ("@observation(scale=0)\ndef a(view): return 0", r"observation a has scale 0, but "),
         ("@reward_term\ndef a(step): return 0",
-         r"a\.py holds no piece: put a decorator of swarmjax\.extension before a function"),
+         r"a\.py defines no piece: put a decorator of swarmjax\.extension before a function"),
     ],
 )  # fmt: skip
 def test_an_unsound_file_is_one_sentence(tmp_path: Path, body: str, sentence: str) -> None:
@@ -110,8 +110,8 @@ def test_pieces_are_handed_over_by_a_word() -> None:
 
 def test_a_word_of_another_program_is_refused() -> None:
     assert refusal(extension.load, "python:0123") == (
-        "extensions is python:0123, which stands for pieces that were defined only in a Python "
-        "program: put them into a file and give extensions=FILE."
+        "extensions is python:0123, which stands for pieces that only a Python program defined: "
+        "put these pieces into a file, and give extensions=FILE."
     )
 
 
@@ -132,7 +132,7 @@ def test_a_piece_that_is_missing_or_has_changed_is_named() -> None:
     needs = {"observation": {"nearest_robot": "0" * 64}}
     assert refusal(extension.check_needs, needs, Extensions(), "p.npz") == (
         "p.npz was trained with the observation nearest_robot of digest 000000000000, but "
-        "extensions holds no such piece: give extensions=FILE, the file of its training."
+        "extensions has no such piece: give extensions=FILE, the file of that training."
     )
     changed = refusal(extension.check_needs, needs, found, "p.npz")
     assert changed.startswith("p.npz was trained with the observation nearest_robot of digest 0000")
@@ -155,7 +155,7 @@ def test_only_the_kinds_that_matter_are_asked_for() -> None:
 )
 def test_whatever_a_file_raises_is_one_sentence(tmp_path: Path, body: str, said: str) -> None:
     mine = extensions.write(tmp_path / "mine.py", body)
-    assert refusal(extension.load, mine) == f"{mine} does not import: {said}"
+    assert refusal(extension.load, mine) == f"{mine} cannot be imported: {said}"
 
 
 @pytest.mark.parametrize("code", ["import sys; sys.exit()", "raise BaseException"])
@@ -177,7 +177,7 @@ def test_whatever_a_piece_raises_is_one_sentence(tmp_path: Path, code: str) -> N
         ("reward_term(weight=True)", "reward mine has weight true: give a number that float32"),
         ("reward_term(weight=jnp.nan)", "reward mine has weight nan: give a number that float32"),
         ("reward_term(weight=10**400)", "reward mine has weight 100000000000000000000"),
-        ("reward_term(weight=1.0, name=3)", "reward 3 is not a valid name: give 1 to 40"),
+        ("reward_term(weight=1.0, name=3)", "reward 3 does not have a valid name: give 1 to 40"),
         ("observation(scale='a')", "observation mine has scale 'a': give a number that float32"),
         ("observation(offset=jnp.inf)", "observation mine has offset inf: give a number that floa"),
         ("observation(size='a')", "observation mine has size 'a': give a whole number, 1 or mo"),

@@ -126,7 +126,7 @@ def test_a_policy_that_is_a_pipe_is_refused(tmp_path: Path) -> None:
     from swarmjax import policy_file
 
     os.mkfifo(tmp_path / "policy.npz")
-    with pytest.raises(PolicyError, match="is no file"):
+    with pytest.raises(PolicyError, match="is not a file"):
         policy_file.read(tmp_path / "policy.npz")
 
 

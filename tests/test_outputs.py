@@ -30,6 +30,6 @@ def test_a_reproduction_wants_an_empty_folder(
     monkeypatch.chdir(tmp_path)
     write(Path("run"), [row(0)])
     assert refusal(reproduce.main, ["out=run"]) == (
-        "out is run, which is not empty: give a new or an empty folder, or resume=run to go on "
-        "with the reproduction in it."
+        "out is run, which is not empty: give a new or an empty folder, or resume=run to continue "
+        "the reproduction in it."
     )

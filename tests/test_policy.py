@@ -142,23 +142,23 @@ def _say(path: Path, text: str) -> None:
         ),
         (
             lambda path: policies.forge(path, policies.arrays(), {"format": 5}, digest="0"),
-            r"its digest is not that of its arrays: it was changed or damaged",
+            "its digest and its arrays do not match: it was changed or damaged",
         ),
-        (lambda path: _claim(path, 2**30 + 1), "it unpacks to more than the file, or"),
+        (lambda path: _claim(path, 2**30 + 1), "it unpacks to more than its size, or"),
         (_compress, "a member is compressed, encrypted, duplicated or no .npy file"),
         (_double, "a member is compressed, encrypted, duplicated or no .npy file"),
         (
             lambda path: _member(path, _npy("<f4", "2147483648,")),
-            "'actor/hidden_9/bias.npy' is not the array",
+            "'actor/hidden_9/bias.npy' does not match its header",
         ),
         (
             lambda path: _member(path, _npy("|O", "1,")),
-            "'actor/hidden_9/bias.npy' is not the array",
+            "'actor/hidden_9/bias.npy' does not match its header",
         ),
         (lambda path: _member(path, _npy("<U0", "1,")), ""),
         (
             lambda path: _member(path, b"\x93NUMPY\x02\x00"),
-            "'actor/hidden_9/bias.npy' is not the array",
+            "'actor/hidden_9/bias.npy' does not match its header",
         ),
         (_crowd, "its list of members has more than 65536 bytes"),
         (lambda path: _say(path, "[" * 100_000), "meta has more than 65536 entries"),
@@ -184,7 +184,9 @@ def test_load_refuses_in_one_sentence(tmp_path: Path, damage: Any, sentence: str
 @pytest.mark.parametrize("path", ["a pipe", "/tmp"])
 def test_load_waits_for_no_pipe(tmp_path: Path, path: str) -> None:
     os.mkfifo(tmp_path / "a pipe")
-    with pytest.raises(PolicyError, match=r"cannot be read as a policy: it is not a plain file\.$"):
+    with pytest.raises(
+        PolicyError, match=r"cannot be read as a policy: it is not a regular file\.$"
+    ):
         policy.load(tmp_path / path)
 
 
@@ -345,7 +347,7 @@ def test_a_memory_is_handed_in_and_out(tmp_path: Path) -> None:
     said = {"memory": {"kind": "gru", "size": 3}}
     loaded = saved(tmp_path / "a.npz", policies.remembering(policies.arrays(), 3), **said)
     seen = np.zeros((5, 2, SIZE), np.float32)
-    with pytest.raises(PolicyError, match=r"^the policy has a memory: call `begin` once an"):
+    with pytest.raises(PolicyError, match=r"^the policy has a memory: use `begin` and `step`"):
         policy.act(loaded, seen)
     with pytest.raises(PolicyError, match=r"^memory is \[2, 3\]: give \[5, 2, 3\], as `begin`"):
         policy.step(loaded, policy.begin(loaded, (2,)), seen)
@@ -367,7 +369,7 @@ def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None
         alone = saved(tmp_path / f"{i}.npz", {n: a[i : i + 1] for n, a in arrays.items()})
         np.testing.assert_array_equal(action[:, i], policy.act(alone, seen[:, i]))
     np.testing.assert_array_equal(policy.act(together, seen[:, :2]), action[:, :2])
-    with pytest.raises(PolicyError, match=r"^4 robots are too many for 3 independent policies\.$"):
+    with pytest.raises(PolicyError, match=r"^4 robots are too many: the policy has 3 networks\.$"):
         policy.act(together, np.zeros((4, SIZE), np.float32))
 
 

@@ -110,8 +110,8 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
 @pytest.mark.parametrize(
     ("arrays", "meta", "sentence"),
     [
-        (_without("actor/mean/bias"), {}, r"actor/mean/bias is missing"),
-        (_GOOD, _MEMORY, r"actor/memory/input/kernel is missing"),
+        (_without("actor/mean/bias"), {}, r"array actor/mean/bias is missing"),
+        (_GOOD, _MEMORY, r"array actor/memory/input/kernel is missing"),
         (_RECALLS, {}, r"actor/mean/kernel has shape \[1, 8, 2\]: expected \[1, 3, 2\]"),
         (
             _RECALLS,
@@ -131,15 +131,16 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             _part("observation", neighbours={"count": 2, "range": 0.7}),
-            r"meta.observation.neighbours is .*: expected none, since 8820a9f is the last commit",
+            r"meta.observation.neighbours is .*: expected nothing, because commit 8820a9f is the "
+            r"last",
         ),
-        (_GOOD, {"format": 2}, r"meta.format is 2, but this version reads 5 only: "),
+        (_GOOD, {"format": 2}, r"meta.format is 2, but this version reads only format 5: "),
         (_RECALLS, _MEMORY | {"network": "mine"}, r"meta.memory and meta.network are both"),
-        (_without("actor/hidden_0/kernel"), {}, r"actor/hidden_0/kernel is missing"),
-        (_without("normalizer/std"), {}, r"normalizer/std is missing"),
-        (_with("critic/bias", _f32([1])), {}, r'"critic/bias" is not known: format 5'),
-        (_with("actor/hidden_2/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
-        (_with("actor/hidden_7/bias", _f32([[1]])), {}, r"actor/hidden_2/kernel is missing"),
+        (_without("actor/hidden_0/kernel"), {}, r"array actor/hidden_0/kernel is missing"),
+        (_without("normalizer/std"), {}, r"array normalizer/std is missing"),
+        (_with("critic/bias", _f32([1])), {}, r'array "critic/bias" is unknown: format 5'),
+        (_with("actor/hidden_2/bias", _f32([[1]])), {}, r"array actor/hidden_2/kernel is missing"),
+        (_with("actor/hidden_7/bias", _f32([[1]])), {}, r"array actor/hidden_2/kernel is missing"),
         (_with("actor/log_std", np.zeros((1, 2))), {}, r"actor/log_std is float64: expected float"),
         (_with("actor/log_std", np.zeros((1, 2), ">f4")), {}, r"actor/log_std is >f4: expected fl"),
         (
@@ -170,7 +171,8 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             {"format": 1},
-            r"meta.format is 1, but this version reads 5 only: d8b3078 is the last commit that "
+            r"meta.format is 1, but this version reads only format 5: commit d8b3078 is the last "
+            r"that "
             "reads formats 2 to 4",
         ),
         (_GOOD, {"activation": "gelu"}, r'meta.activation is "gelu": expected tanh or relu or sw'),
@@ -198,7 +200,7 @@ _MEMORY = {"memory": {"kind": "gru", "size": 5}}
         (
             _GOOD,
             _part("observation", names=["same"] * SIZE),
-            r"meta.observation.names is .*: expected names that differ",
+            r"meta.observation.names is .*: expected different names",
         ),
         (
             _GOOD,
@@ -298,7 +300,7 @@ def test_the_digest_covers_arrays_and_meta(tmp_path: Path) -> None:
     for arrays, said in ((policies.arrays(seed=1), _said()), (_GOOD, faster)):
         forge(path, arrays, said, digest=sound)
         with pytest.raises(
-            PolicyError, match=r"its digest is not that of its arrays: it was chang"
+            PolicyError, match=r"its digest and its arrays do not match: it was chang"
         ):
             policy_file.read(path)
 
@@ -364,7 +366,7 @@ def _npy(descr: str, shape: str, data: bytes = b"", spaces: int = 0) -> bytes:
     ],
 )
 def test_read_refuses_a_forged_member(tmp_path: Path, data: bytes) -> None:
-    sentence = "'actor/mean/bias.npy' is not the array that its header says"
+    sentence = "'actor/mean/bias.npy' does not match its header"
     assert sentence in _refused(tmp_path, "actor/mean/bias", data)
 
 
@@ -398,7 +400,9 @@ def _refused(folder: Path, name: str, data: bytes) -> str:
 )
 def test_read_refuses_arrays_that_no_policy_has(tmp_path: Path, name: str) -> None:
     forge(tmp_path / "policy.npz", _with(name, _f32([1])), _said())
-    with pytest.raises(PolicyError, match=r'policy\.npz: "[^\n]+" is not known: format 5 has no'):
+    with pytest.raises(
+        PolicyError, match=r'policy\.npz: array "[^\n]+" is unknown: format 5 has no'
+    ):
         policy_file.read(tmp_path / "policy.npz")
 
 
@@ -413,7 +417,7 @@ def test_read_refuses_members_that_no_policy_has(tmp_path: Path) -> None:
     for content in (doubled, compressed, _zip([*members, ("meta", b"")])):
         path.write_bytes(content)
         with pytest.raises(
-            PolicyError, match=r"duplicated or no \.npy file|unpacks to more than the"
+            PolicyError, match=r"duplicated or no \.npy file|unpacks to more than its"
         ):
             policy_file.read(path)
 
@@ -435,7 +439,9 @@ def test_read_refuses_members_that_overlap(tmp_path: Path) -> None:
         at += 46 + len(name)
     path.write_bytes(content[:start] + bytes(directory))
     assert len(names) * len(content) > sum(sizes)
-    with pytest.raises(PolicyError, match="it unpacks to more than the file, or 1073741824 bytes"):
+    with pytest.raises(
+        PolicyError, match=("it unpacks to more than its size, or to over 1073741824 bytes")
+    ):
         policy_file.read(path)
 
 
@@ -450,7 +456,7 @@ def test_an_open_file_is_read_wherever_it_stands(tmp_path: Path) -> None:
 def test_read_refuses_what_is_no_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")  # reading it would wait for ever
     for path in (tmp_path / "none.npz", tmp_path, tmp_path / "pipe", "a\0b"):
-        with pytest.raises(PolicyError, match=r" is (no file|a folder): | cannot be read: "):
+        with pytest.raises(PolicyError, match=r" is (not a file|a folder): | cannot be read: "):
             policy_file.read(path)
 
 

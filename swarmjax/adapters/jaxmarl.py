@@ -110,7 +110,7 @@ class SwarmMultiAgentEnv(_base):
     def _stack(self, actions: _ByAgent) -> Array:
         """Returns the actions of all agents, [N, U]."""
         if missing := sorted(set(self.agents) - set(actions)):
-            raise ValueError(f"actions lack {missing}: give one for each agent.")
+            raise ValueError(f"actions lack {missing}: give an action for each agent.")
         for agent in self.agents:
             check(actions[agent], (self.robots.action_size,), f"{agent}: ")
         return jnp.stack([actions[agent] for agent in self.agents])

@@ -34,5 +34,5 @@ def find(module: str, extra: str, name: str | None = None) -> Any:
     except (ImportError, AttributeError) as error:
         reason = str(error).strip().partition("\n")[0].rstrip(".")
         raise ImportError(
-            f"{module} cannot be used here ({reason}): pip install swarmjax[{extra}]."
+            f"{module} cannot be used here ({reason}): run pip install swarmjax[{extra}]."
         ) from error

@@ -113,6 +113,6 @@ def line_up_arena(swarm: Swarm) -> RobotRow:
     """
     if swarm.num_arenas != 1:
         raise ValueError(
-            f"arenas is {swarm.num_arenas}, but this adapter steps one: make_env(..., arenas=1)."
+            f"arenas is {swarm.num_arenas}, but this adapter steps a single arena: give arenas=1."
         )
     return line_up(swarm)

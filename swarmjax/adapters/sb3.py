@@ -100,13 +100,13 @@ class SwarmVecEnv(_base):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Raises AttributeError, because one program steps all environments."""
-        raise AttributeError(f"{attr_name} cannot be set: the robots are stepped by one program.")
+        raise AttributeError(f"{attr_name} cannot be set: one program steps all robots.")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Raises AttributeError, because one program steps all environments."""
-        raise AttributeError(f"{method_name} cannot be called: one program steps the robots.")
+        raise AttributeError(f"{method_name} cannot be called: one program steps all robots.")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> Sequence[bool]:
         """Returns False for each environment: none is wrapped."""

@@ -86,8 +86,8 @@ def shared_words(cls: type[Section], found: Mapping[str, Any], path: Path) -> li
             raise ConfigError(f"{path}: {section.unknown_key(root, cls)}")
         if root not in cls.shared:
             raise ConfigError(
-                f"{path}: {key} cannot be set by a file, which may set {', '.join(cls.shared)}: "
-                f"remove it, and give {key} on the command line."
+                f"{path}: {key} cannot be set in a file, which may set only "
+                f"{', '.join(cls.shared)}: give {key} on the command line."
             )
     return write_words(
         {
@@ -190,16 +190,16 @@ def named_path(folder: str, choice: str, key: str) -> Path:
     check_text(key, choice)
     if is_path(choice):
         if not Path(choice).exists():
-            raise ConfigError(f"{key} is '{choice}', and there is no such file.")
+            raise ConfigError(f"{key} is '{choice}', but this file does not exist: check the path.")
         return Path(choice)
     names = choices(folder)
     if choice not in names:
         # Short names such as s7 and s6 share half their letters. difflib's default requires 0.6.
         near = difflib.get_close_matches(choice, names, n=1, cutoff=0.5)
-        hint = f"give {near[0]}, the nearest, or" if near else "give"
+        hint = f"give {near[0]} (the most similar name) or" if near else "give"
         if choice.startswith("[") and key == "stage":
-            hint = f"give stage=curriculum 'stage.sequence={choice}' for several, or"
-        file = ", or a file .yaml" if folder in _OWN_FILES else ""
+            hint = f"give stage=curriculum 'stage.sequence={choice}' for several stages, or"
+        file = ", or the path of a .yaml file" if folder in _OWN_FILES else ""
         raise ConfigError(f"{key} is {show(choice)}: {hint} one of {', '.join(names)}{file}.")
     return _config_dir() / folder / f"{choice}.yaml"
 
@@ -233,7 +233,7 @@ def parse(cls: type[Section], overrides: Sequence[str]) -> dict[str, Any]:
             raise section.unknown_key(root, cls)
         if key in derived:
             advice = [f": choose a file, as in {root}={name}" for name in choices(root)[-1:]]
-            raise ConfigError(f"{key} cannot be given{''.join(advice)}.")
+            raise ConfigError(f"{key} cannot be set by itself{''.join(advice)}.")
         is_text = key in known and str in values.options(known[key].type)
         if choices(key) or is_text:
             check_text(key, value)
@@ -265,7 +265,7 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(inner, dict):
                 whole = ".".join(above[:depth])
                 raise ConfigError(
-                    f"{key} is not a key, since {whole} is {show(inner)}: leave one of them out."
+                    f"{key} cannot be set if {whole} is {show(inner)}: leave out one of the two."
                 )
         inner[last] = value
     return found

@@ -44,7 +44,7 @@ def read_bytes(path: Path, most: int = MOST_TYPED) -> bytes:
 def _open(path: Path) -> BinaryIO:
     """Opens a regular file, and refuses pipes and devices, on which reading could block."""
     if path.exists() and not path.is_file():
-        raise OSError(0, "it is no plain file")
+        raise OSError(0, "it is not a regular file")
     return path.open("rb")
 
 
@@ -156,7 +156,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     content = parse_yaml(read_text(path), f"{called(path)} cannot be read: ")
     if not isinstance(content, dict | None):
-        raise ConfigError(f"{called(path)} is not a list of keys and values: write key: value.")
+        raise ConfigError(f"{called(path)} must hold keys: write `key: value` on each line.")
     return content or {}
 
 
@@ -197,9 +197,9 @@ def _measure(events: Iterable[Any], where: str) -> None:
     depth = count = 0
     for event in events:
         if getattr(event, "tag", None) is not None:
-            raise ConfigError(f"{where}it has the tag {show(event.tag)}: remove it.")
+            raise ConfigError(f"{where}remove the YAML tag {show(event.tag)}.")
         if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for billions
-            raise ConfigError(f"{where}it has the alias *{event.anchor}: write the value itself.")
+            raise ConfigError(f"{where}replace the YAML alias *{event.anchor} by its value.")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         count += isinstance(event, yaml.CollectionStartEvent | yaml.ScalarEvent)
@@ -236,7 +236,7 @@ def _loader() -> Any:
                 if not isinstance(name, str):
                     raise ValueError(f"key {show(name)} is not text")
                 if name in found:
-                    raise ValueError(f"key {show(name)} is there twice")
+                    raise ValueError(f"key {show(name)} is given twice")
                 found[name] = self.construct_object(value, deep=deep)
             return found
 

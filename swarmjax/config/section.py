@@ -141,9 +141,9 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
         value, chosen, default = getattr(section, key), getattr(section, selector), defaults[key]
         if chosen not in choices and value != default:
             raise ConfigError(
-                f"{key} is {show(value, quote='')}, but {selector} is {chosen}: {key} is an option "
-                f"of {' and '.join(choices)}, so give {show(default, quote='')} or "
-                f"{selector}={choices[0]}."
+                f"{key} is {show(value, quote='')}, but {selector} is {chosen} and does not use "
+                f"{key}: leave {key} at {show(default, quote='')}, or give "
+                f"{selector}={' or '.join(choices)}."
             )
 
 
@@ -190,13 +190,13 @@ def build[C: Section](cls: type[C], mapping: Mapping[str, Any], where: str = "")
     if not isinstance(mapping, Mapping):
         key = where.rstrip(": .")
         first = f"{where}{next(iter(known))}"
-        raise ConfigError(f"{key} is {show(mapping)}: give its keys, such as {first}.")
+        raise ConfigError(f"{key} is {show(mapping)}: give one of its keys, such as {first}.")
     for key in mapping:
         if key not in known:
             raise unknown_key(str(key), cls, where)
     for key, item in known.items():
         if key not in mapping and _is_required(item):
-            raise ConfigError(f"{where}{key} is missing and has no default: give it.")
+            raise ConfigError(f"{where}{key} is missing and has no default: give it a value.")
     made = {key: convert(known[key].type, value, f"{where}{key}") for key, value in mapping.items()}
     try:
         return cls(**made)
@@ -221,7 +221,7 @@ def build_stored[C: Section](cls: type[C], stored: Any, where: str) -> C:
     except UnknownKeyError as error:
         key = str(error).partition(" is not a key: ")[0]
         raise ConfigError(
-            f"{key} is not a key: if an older version wrote it, only that version reads it."
+            f"{key} is not a key of this version: if an older version wrote it, use that version."
         ) from None
 
 
@@ -268,7 +268,7 @@ def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
 def _by_name(hint: object, value: object, key: str) -> ByName:
     """Converts a mapping from names, which no section defines, to values of one type."""
     if not isinstance(value, Mapping):
-        raise ConfigError(f"{key} is {show(value)}: give values by name, as in {key}.NAME=1.")
+        raise ConfigError(f"{key} is {show(value)}: give named values, as in {key}.NAME=1.")
     for name in value:
         check_text(key, str(name))
     return ByName({str(name): convert(hint, each, f"{key}.{name}") for name, each in value.items()})

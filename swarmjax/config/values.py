@@ -118,7 +118,7 @@ def check_text(key: str, text: str) -> None:
     longest = max(map(len, re.split(b"[/,]", text.encode())))
     if longest > _MOST_NAME:
         raise ConfigError(
-            f"{key} is {show(text)}, with a name of {longest} bytes: give at most {_MOST_NAME}."
+            f"{key} is {show(text)}: shorten the name of {longest} bytes to at most {_MOST_NAME}."
         )
 
 

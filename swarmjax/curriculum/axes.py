@@ -41,8 +41,8 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
     count = math.prod(map(len, columns))
     if count > MOST_STAGES:
         raise ConfigError(
-            f"curriculum.axes makes {count} stages, with the stage's own values: give values for "
-            f"at most {MOST_STAGES}."
+            f"curriculum.axes makes {count} stages, including those with the stage's own values: "
+            f"give fewer values, for at most {MOST_STAGES} stages."
         )
     grid = []
     for values in itertools.product(*columns):
@@ -55,11 +55,11 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
 def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
     """Refuses an axis that is unknown or has invalid values."""
     if key not in AXES:
-        raise ConfigError(f"curriculum.axes.{key} is no axis: give one of {', '.join(AXES)}.")
+        raise ConfigError(f"curriculum.axes.{key} is not an axis: give one of {', '.join(AXES)}.")
     if not isinstance(values, Sequence) or isinstance(values, str) or not values:
         raise ConfigError(
             f"curriculum.axes.{key} is {show(values)}: give a list of values from easy to hard, "
-            "without the stage's own."
+            "and leave out the stage's own value."
         )
     for value in values:
         ends = value if isinstance(value, Sequence) and len(value) == 2 else [value]
@@ -69,12 +69,12 @@ def _check(stage: Mapping[str, Any], key: str, values: Any) -> None:
             )
         if values.count(value) > 1:
             raise ConfigError(
-                f"curriculum.axes.{key} holds {show(value)} more than once: give it once."
+                f"curriculum.axes.{key} holds {show(value)} more than once: give each value once."
             )
     if stage.get(key) in values:
         raise ConfigError(
-            f"curriculum.axes.{key} is {show(values)}, but stage.{key} is "
-            f"{show(stage[key])}: leave the stage's own value out; it comes last by itself."
+            f"curriculum.axes.{key} is {show(values)}, but stage.{key} is {show(stage[key])}: "
+            "leave out this value, because it is added as the last one."
         )
 
 

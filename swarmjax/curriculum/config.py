@@ -88,6 +88,6 @@ def check_mode(mode: str, own: Sequence[OwnCurriculum]) -> None:
     names = [*MODES, *(piece.name for piece in own)]
     if mode not in names:
         raise ConfigError(
-            f"curriculum.mode is {show(mode)}: give one of {', '.join(names)}, or extensions=FILE, "
-            "a file that defines it."
+            f"curriculum.mode is {show(mode)}: give one of {', '.join(names)}, or add "
+            "extensions=FILE, the Python file that defines this curriculum."
         )

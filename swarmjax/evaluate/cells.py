@@ -89,13 +89,13 @@ def load(config: EvaluateConfig) -> Suite:
         return Suite(None, (draw_stage(config, range(config.episodes)),))
     if config.robot.hull_radius > epuck.HULL_RADIUS:
         raise ConfigError(
-            f"robot.hull_radius is {show(config.robot.hull_radius)}, but suites are drawn for "
-            f"{epuck.HULL_RADIUS}: give at most that."
+            f"robot.hull_radius is {show(config.robot.hull_radius)}, but the levels of suites are "
+            f"made for hulls of at most {epuck.HULL_RADIUS} m: give at most {epuck.HULL_RADIUS}."
         )
     if config.task.target_radius != _TARGET_RADIUS:
         raise ConfigError(
-            f"task.target_radius is {show(config.task.target_radius)}, but suites are drawn for "
-            f"{_TARGET_RADIUS}: give that."
+            f"task.target_radius is {show(config.task.target_radius)}, but the levels of suites "
+            f"are made for {_TARGET_RADIUS} m: give {_TARGET_RADIUS}."
         )
     if Path(config.suite).suffix == ".npz":
         return read(Path(config.suite))
@@ -151,8 +151,8 @@ def _cell(settings: CellConfig, episodes: np.ndarray, levels: Level) -> Cell:
     cell = Cell(*about, episodes, levels, settings.steps)
     if settings.digest not in (None, cell.digest):
         raise ConfigError(
-            f"cell {cell.name} has the digest {cell.digest[:12]}..., but "
-            f"{settings.digest[:12]}... is recorded: the levels differ."
+            f"the levels of cell {cell.name} have the digest {cell.digest[:12]}..., but the suite "
+            f"records {settings.digest[:12]}...: the levels have changed."
         )
     return cell
 
@@ -223,7 +223,7 @@ def read(path: Path) -> Suite:
     check_text("suite", str(path))
     try:
         if path.exists() and not path.is_file():
-            raise ValueError("it is not a plain file")  # reading a pipe would wait for its writer
+            raise ValueError("it is not a regular file")  # reading a pipe would wait for its writer
         with path.open("rb") as file:
             arrays = policy.unpack(file)
         return _parse(arrays)

@@ -87,7 +87,7 @@ class EvaluateConfig(JudgeConfig):
     def _check(self) -> None:
         if (self.policy is None) == (self.compare is None):
             raise ConfigError(
-                f"policy is {show(self.policy)} and compare is {show(self.compare)}: give one of "
-                "them, policy=FILE or compare=FILE,FILE."
+                f"policy is {show(self.policy)} and compare is {show(self.compare)}: give exactly "
+                "one of the two, policy=FILE or compare=FILE,FILE."
             )
         super()._check()

@@ -343,8 +343,8 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down, with positions that are not finite: give more than "
-            f"{judge.substeps} substeps, or a robot closer to the real one."
+            "the physics broke down: some positions are not finite; give a sim.substeps of more "
+            f"than {judge.substeps}, or a robot closer to the e-puck."
         )
     return memory, body.pose(qpos, np)
 

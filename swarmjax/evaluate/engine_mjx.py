@@ -101,8 +101,8 @@ def play(
     outcome, broken = run(weights, network and network.params, levels, memory)
     if np.any(broken):
         raise ConfigError(
-            f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down, with "
-            f"positions that are not finite: give more than {world.physics.substeps} substeps."
+            f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down: some "
+            f"positions are not finite; give a sim.substeps of more than {world.physics.substeps}."
         )
     return Outcome(*map(np.asarray, outcome))
 

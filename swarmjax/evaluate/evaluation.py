@@ -82,8 +82,8 @@ def _sides(settings: EvaluateConfig) -> list[list[str]]:
     first, second = map(len, sides)
     if first != second:
         raise ConfigError(
-            f"compare is {show(settings.compare)}, with {first} and {second} policies: give the "
-            "same number on both sides, with the same seeds in the same order."
+            f"compare is {show(settings.compare)}, which names {first} and {second} policies: give "
+            "as many before the comma as after it, with the same seeds in the same order."
         )
     return sides
 
@@ -105,7 +105,7 @@ def list_files(key: str, text: str) -> list[str]:
     for part in [text] if os.path.isfile(text) else text.split(","):
         matches = sorted(glob(part)) if set(part) & set("*?[") else [part]
         if not matches or not part:
-            raise ConfigError(f"{key} is {show(text)}, and {show(part)} matches no file.")
+            raise ConfigError(f"{key} is {show(text)}, but no file matches {show(part)}.")
         files += matches
     for file in files:
         if files.count(file) > 1:

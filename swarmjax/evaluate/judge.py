@@ -183,7 +183,7 @@ def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
     taken = sorted({*goal.measures} & {*MEASURES})
     if taken:
         raise ConfigError(
-            f"goal {config.task.goal} measures {', '.join(taken)}, as every goal does: rename it."
+            f"goal {config.task.goal} must rename {', '.join(taken)}, which every goal measures."
         )
     own_goals.check(own[0], goal, config.robot, config.stage.robots, config.stage.obstacles)
     return own_goals.SideBySide(goal)
@@ -228,14 +228,14 @@ def check_policy(
         given = layout.get(key)
         if given != expected:
             raise PolicyError(
-                f"{path} was trained on observations that differ from this robot's: its "
+                f"{path} was trained with observations that this robot does not have: the policy's "
                 f"meta.observation.{key} is {_list(given)}, expected {_list(expected)}."
             )
     learners = len(trained.log_std)
     if not trained.is_shared and stage.robots > learners:
         raise PolicyError(
             f"{path} holds a network for each of {learners} robots, but stage {stage.name} has "
-            f"{stage.robots}: give a shared policy, or a stage of 1 to {learners}."
+            f"{stage.robots} robots: give a shared policy, or a stage with 1 to {learners} robots."
         )
 
 
@@ -244,9 +244,9 @@ def _check_sensors(path: str | None, trained: Policy, poses: Sequence[Pose]) -> 
     theirs = trained.meta.get("sensors", {}).get("poses", epuck.SENSOR_POSES)
     if [*map(tuple, theirs)] != [*map(tuple, poses)]:
         raise PolicyError(
-            f"{path} was trained with other sensors: its meta.sensors.poses is {show(theirs)}, but "
-            f"robot.sensor_poses is {show(poses)}; leave robot and robot.sensor_poses as trained, "
-            "or train a policy for this robot."
+            f"{path} was trained with other sensors: the policy's meta.sensors.poses is "
+            f"{show(theirs)}, but robot.sensor_poses is {show(poses)}: keep robot and "
+            "robot.sensor_poses as trained, or train a policy for this robot."
         )
 
 

@@ -111,7 +111,7 @@ def cvar(
       ValueError: share is out of range, or x is empty or holds nan or -inf.
     """
     if not 0 < share <= 1:
-        raise ValueError(f"share is {share}: give more than 0, at most 1.")
+        raise ValueError(f"share is {share}: give a number above 0 and at most 1.")
     values = _flat(x, axis)
     count = values.shape[-1]
     # Rounded first: 0.07 * 100 is 7.000000000000001, but means seven values.
@@ -187,11 +187,11 @@ def paired(
     """
     before, after = _table("a", a, draw), _table("b", b, draw)
     if before.shape != after.shape:
-        raise ValueError(f"a is {before.shape} and b is {after.shape}: give pairs of equal shapes.")
+        raise ValueError(f"a is {before.shape} and b is {after.shape}: give equal shapes.")
     for name, table in (("a", before), ("b", after)):
         if np.isinf(table).any():
             raise ValueError(
-                f"{name} holds inf, and inf - inf is no number: use probability_of_improvement."
+                f"{name} holds inf, and inf - inf is not defined: use probability_of_improvement."
             )
 
     def difference(at: _Index) -> np.ndarray:
@@ -279,7 +279,7 @@ def checked(name: str, x: ArrayLike) -> np.ndarray:
     if np.isnan(values).any():
         raise ValueError(f"{name} holds nan: {np.isnan(values).sum()} of {values.size} values.")
     if (values == -np.inf).any():
-        raise ValueError(f"{name} holds -inf: give finite values, or inf for never reached.")
+        raise ValueError(f"{name} holds -inf: give numbers, or inf if never reached.")
     return values
 
 
@@ -297,7 +297,7 @@ def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
     """Converts numbers [runs, tasks]; refuses too few runs or tasks to draw from."""
     values = checked(name, x)
     if values.ndim != 2:
-        raise ValueError(f"{name} has shape {values.shape}: give [runs, tasks].")
+        raise ValueError(f"{name} has shape {values.shape}: give an array of shape [runs, tasks].")
     for what, count in zip(("runs", "tasks"), values.shape, strict=True):
         if what in draw and count < LEAST_DRAWN:
             raise ValueError(

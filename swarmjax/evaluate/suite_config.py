@@ -59,7 +59,7 @@ class SuiteFileConfig(Section):
             raise ConfigError("cells is []: give at least one cell.")
         for name in names:
             if names.count(name) > 1:
-                raise ConfigError(f"cells names {name} more than once: give each name once.")
+                raise ConfigError(f"cells lists {name} more than once: give each name once.")
 
 
 def read_suite(choice: str) -> SuiteFileConfig:

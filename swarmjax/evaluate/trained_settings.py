@@ -101,7 +101,7 @@ def load[C: Section](
       PolicyError: A policy is unsound.
     """
     if "task.step_limit" in files.parse(cls, typed):
-        raise ConfigError("task.step_limit ends only episodes of training: give steps=NUMBER.")
+        raise ConfigError("task.step_limit works only in training: give steps=NUMBER instead.")
     if entrants is None:
         metas = {path: policy_file.read_meta(path) for path in _paths(cls, typed)}
     else:
@@ -149,8 +149,8 @@ def _check_alike(
             key = word.partition("=")[0]
             if key not in given:
                 raise ConfigError(
-                    f"{paths[0]} and {path} were trained with different values of {key}: choose "
-                    f"the one to judge them with, as in {word}."
+                    f"{paths[0]} and {path} were trained with different values of {key}: give one "
+                    f"value for all policies, as in {word}."
                 )
 
 

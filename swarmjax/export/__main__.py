@@ -55,7 +55,7 @@ def main(arguments: Sequence[str]) -> int:
     targets = _targets(settings, trained)
     leaves, update, skipped, *_ = checkpoint.find(run, settings.step)
     for sentence in skipped:
-        sys.stderr.write(f"swarmjax.export: {sentence}: it was skipped.\n")
+        sys.stderr.write(f"swarmjax.export: {sentence} and was skipped.\n")
     for seed, out in targets.items():
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / POLICY
@@ -87,7 +87,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
         )
     ending = Path(_NAMES[settings.format]).suffix
     if out.suffix != ending and ending:
-        raise ConfigError(f"out is {out}, but format is {settings.format}: end it in {ending}.")
+        raise ConfigError(f"out is {out}, but format is {settings.format}: end out with {ending}.")
     return out
 
 
@@ -133,29 +133,29 @@ def _check_form(meta: Mapping[str, Any], form: str) -> None:
     """Checks that a form can hold a policy, and that its controller can measure all inputs."""
     if "network" in meta:
         raise PolicyError(
-            f"format is {form}, but the policy's network is {show(meta['network'])}, code of an "
-            "extension that only npz supports: give format=npz, or train with algo.network=mlp."
+            f"format is {form}, but only npz can hold the policy's network "
+            f"{show(meta['network'])}: give format=npz, or train with algo.network=mlp."
         )
     if form != "webots":
         return
     poses = meta["sensors"].get("poses", epuck.SENSOR_POSES)
     if [*map(tuple, poses)] != [*epuck.SENSOR_POSES]:
         raise PolicyError(
-            f"format is webots, whose controller drives an e-puck, but the policy's robot has "
-            f"{len(poses)} sensors of its own: give format=c or onnx, and your own controller."
+            "format is webots, whose controller drives an e-puck, but the policy's robot has "
+            f"{len(poses)} other sensors: give format=c or onnx, and write your own controller."
         )
     goal = meta["task"].get("goal", "navigate")
     if goal != "navigate" or meta["task"].get("target_speed"):
         raise PolicyError(
             f"format is webots, whose world has targets that stay, but the policy's goal is {goal} "
-            "with targets that move: give format=c or onnx, and your own controller."
+            "with targets that move: give format=c or onnx, and write your own controller."
         )
     known = webots_controller.QUANTITIES
     unknown = [name for name in meta["observation"]["names"] if name not in known]
     if unknown:
         raise PolicyError(
             f"format is webots, but the policy observes {', '.join(unknown)}, which the controller "
-            "cannot measure: give format=c or onnx, and your own controller."
+            "cannot measure: give format=c or onnx, and write your own controller."
         )
     _check_range(meta)
 
@@ -165,9 +165,9 @@ def _check_range(meta: Mapping[str, Any]) -> None:
     reach, farthest = meta["sensors"]["range"], response.REACH["webots"]
     if meta["observation"]["encoding"] == "metric" and reach > farthest:
         raise ConfigError(
-            f"format is webots, but the policy was trained with infrared to {reach:g} m, and "
-            f"Webots' sensors measure distances only to {farthest:g} m: train with "
-            f"robot.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
+            "format is webots, but the policy was trained with infrared sensors that reach "
+            f"{reach:g} m, and those of Webots measure distances only to {farthest:g} m: train "
+            f"with robot.sensor_range={epuck.SENSOR_RANGE:g}, or give format=c or onnx."
         )
 
 

@@ -32,13 +32,13 @@ class ExportConfig(Section):
     def _check(self) -> None:
         if (self.run is None) == (self.policy is None):
             raise ConfigError(
-                f"run is {show(self.run)} and policy is {show(self.policy)}: give one of them, "
-                "as in run=runs/a or policy=policy.npz."
+                f"run is {show(self.run)} and policy is {show(self.policy)}: give exactly one of "
+                "the two, as in run=runs/a or policy=policy.npz."
             )
         for key in ("step", "seed"):
             if self.run is None and getattr(self, key) is not None:
                 raise ConfigError(
-                    f"{key} is {getattr(self, key)}, but policy is one file: give {key} with run."
+                    f"{key} is {getattr(self, key)}, but works only with run: leave {key} out."
                 )
         if self.out is None and self.run is None and self.format == "npz":
             raise ConfigError("out is null, but policy is already an npz file: give out=FILE.")

@@ -177,8 +177,8 @@ def find_devices(robot: Any, period: int) -> Devices:
     for name, device in devices.items():
         if device is None:
             raise ValueError(
-                f"the robot has no device {name!r}: an E-puck with a GPS and a Compass in its "
-                "turretSlot has all of them."
+                f"the robot has no device {name!r}: use an E-puck with a GPS and a Compass in its "
+                "turretSlot."
             )
     *sensors, left, right = devices.values()
     for sensor in sensors:
@@ -207,13 +207,13 @@ def control_period(trained: Policy, basic_step: float) -> int:
     period = 1000 * trained.meta["task"]["control_step"]
     if abs(round(period) - period) > 1e-6 * period:
         raise ValueError(
-            f"the control step of the policy is {period:g} ms: Webots needs whole milliseconds."
+            f"the control step of the policy is {period:g} ms, but Webots needs whole milliseconds."
         )
     steps = round(period / basic_step)
     if steps < 1 or abs(steps * basic_step - period) > 1e-6 * period:
         raise ValueError(
-            f"basicTimeStep is {basic_step:g} ms: give {period:g} ms, the control step of the "
-            "policy, or a divisor of it."
+            f"basicTimeStep is {basic_step:g} ms: give {period:g} ms, which is the policy's "
+            f"control step, or a divisor of {period:g} ms."
         )
     return round(period)
 

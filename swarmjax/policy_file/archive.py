@@ -83,7 +83,7 @@ def write(path: str | Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     """Returns the arrays, `meta` and digest of a file, all of them checked."""
     if not path.is_file():
-        what = "a folder" if path.is_dir() else "no file"
+        what = "a folder" if path.is_dir() else "not a file"
         raise PolicyError(f"{path} is {what}: give the path of a policy.npz.")
     arrays, text, digest = policy.read(path)
     try:

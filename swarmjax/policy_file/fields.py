@@ -142,7 +142,7 @@ _OPTIONAL = {  # fields of `meta` that may be missing, each with the rules that 
     "task.step_limit": {"task.step_limit": _whole(1)},
     "observation.neighbours": {
         "observation.neighbours": _Rule(
-            "none, since 8820a9f is the last commit that reads such a policy", lambda _: False
+            "nothing, because commit 8820a9f is the last that reads it", lambda _: False
         ),
     },
 }
@@ -161,8 +161,8 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
     """
     if meta.get("format") != FORMAT:
         raise PolicyError(
-            f"meta.format is {short_json(meta.get('format'))}, but this version reads {FORMAT} "
-            f"only: {_LAST_READER} is the last commit that reads formats 2 to 4."
+            f"meta.format is {short_json(meta.get('format'))}, but this version reads only format "
+            f"{FORMAT}: commit {_LAST_READER} is the last that reads formats 2 to 4."
         )
     _check_fields(meta, _FIELDS)
     for field, rules in _OPTIONAL.items():
@@ -170,7 +170,7 @@ def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
             _check_fields(meta, rules)
             if field == "memory" and "network" in meta:
                 raise PolicyError(
-                    "meta.memory and meta.network are both given: expected one of them."
+                    "meta.memory and meta.network are both given: expected only one of the two."
                 )
     if meta["policy"] == "shared" and meta["learners"] != 1:
         raise PolicyError(f"meta.learners is {meta['learners']}: expected 1 for a shared policy.")
@@ -201,7 +201,7 @@ def _check_observation(meta: Mapping[str, Any]) -> None:
     layout, names = meta["observation"], meta["observation"]["names"]
     if not names or len(set(names)) < len(names):
         raise PolicyError(
-            f"meta.observation.names is {short_json(names)}: expected names that differ."
+            f"meta.observation.names is {short_json(names)}: expected different names."
         )
     if len(layout["units"]) != len(names):
         raise PolicyError(
@@ -211,7 +211,7 @@ def _check_observation(meta: Mapping[str, Any]) -> None:
     rule = _numbers(len(names))
     _check_fields(meta, {"observation.offset": rule, "observation.scale": rule})
     if not np.array(layout["scale"], np.float32).all():
-        raise PolicyError("meta.observation.scale holds 0, but it is a divisor.")
+        raise PolicyError("meta.observation.scale holds 0, but observations are divided by scale.")
 
 
 def _check_action(layout: Mapping[str, Any]) -> None:
@@ -232,17 +232,17 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> 
     for name in shapes:
         if name not in arrays:
             depth = _hidden_layers(arrays, meta)
-            raise PolicyError(f"{name} is missing: the policy has {depth} hidden layers.")
+            raise PolicyError(f"array {name} is missing: the policy has {depth} hidden layers.")
     for name, array in arrays.items():
         if name not in shapes:
             raise PolicyError(
-                f"{short_json(name)} is not known: format {FORMAT} has no such array."
+                f"array {short_json(name)} is unknown: format {FORMAT} has no array of this name."
             )
         _check_array(name, array, shapes[name])
     if (arrays["normalizer/std"] < _SMALLEST).any():
         raise PolicyError(
-            f"normalizer/std holds a value below {_SMALLEST:.3g}, but it is a divisor, and devices "
-            "take smaller numbers for 0."
+            f"normalizer/std holds a value below {_SMALLEST:.3g}, but observations are divided by "
+            "it, and devices round smaller numbers to 0."
         )
 
 
@@ -252,7 +252,7 @@ def _check_array(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape:
         raise PolicyError(f"{name} has shape {list(array.shape)}: expected {list(shape)}.")
     if not np.isfinite(array).all():
-        raise PolicyError(f"{name} holds a value that is not finite: expected numbers.")
+        raise PolicyError(f"{name} holds a value that is not finite: expected finite numbers.")
 
 
 def _hidden_layers(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> int:

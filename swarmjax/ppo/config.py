@@ -145,7 +145,7 @@ class AlgoConfig(Section):
         if self.memory != "none" and self.network not in (None, "mlp"):
             raise ConfigError(
                 f"network is {show(self.network)}, but memory is {self.memory}, which works only "
-                "with hidden layers: give network=mlp or memory=none."
+                "with network=mlp: give network=mlp or memory=none."
             )
 
 
@@ -163,13 +163,13 @@ def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
     names = [piece.name for piece in networks]
     if config.network is None and len(names) > 1:
         raise ConfigError(
-            f"extensions holds the networks {', '.join(names)}: choose one, as in "
+            f"extensions defines the networks {', '.join(names)}: choose one, as in "
             f"algo.network={names[0]}."
         )
     name = config.network or [*names, "mlp"][0]
     if name not in ("mlp", *names):
         raise ConfigError(
-            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or "
-            "extensions=FILE, a file that defines it."
+            f"algo.network is {show(name)}: give one of {', '.join(['mlp', *names])}, or add "
+            "extensions=FILE, the Python file that defines this network."
         )
     return name

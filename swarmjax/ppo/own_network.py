@@ -40,11 +40,11 @@ def _check(torso: Any, name: str, observation_size: int) -> None:
         found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
     other = sorted(set(variables) - {"params"})
     if other:
-        raise ConfigError(f"{where} keeps {', '.join(other)}: a network may keep only params.")
+        raise ConfigError(f"{where} has {', '.join(other)}: a network may have only params.")
     shape = getattr(found, "shape", ())
     if len(shape) != 2 or shape[0] != 3 or found.dtype != jnp.float32:
         kind = getattr(found, "dtype", type(found).__name__)
         raise ConfigError(
-            f"{where} turns float32 [3, {observation_size}] into {kind} {list(shape)}: return "
-            "float32 [3, F], the features that the heads take."
+            f"{where} returns {kind} {list(shape)} for float32 [3, {observation_size}]: return "
+            "float32 [3, F], where F is the number of features."
         )

@@ -30,10 +30,10 @@ class ReplayConfig(JudgeConfig):
             )
         if self.level is not None and self.worst is not None:
             raise ConfigError(
-                f"level is {self.level}, but worst is {self.worst}: give one of the two."
+                f"level is {self.level} and worst is {self.worst}: give only one of the two."
             )
         if self.suite is not None and self.worst is None:
-            raise ConfigError(f"suite is {show(self.suite)}: say which levels, as in worst=5.")
+            raise ConfigError(f"suite is {show(self.suite)}: give worst too, as in worst=5.")
         if self.level is not None and not re.fullmatch(r"\d{1,10}(,\d{1,10})*", self.level):
             raise ConfigError(
                 f"level is {show(self.level)}: give whole numbers with commas between them, "

@@ -48,8 +48,8 @@ def check() -> None:
             mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
     except Exception as error:  # each platform's library raises its own errors
         raise ConfigError(
-            f"video cannot be made here ({type(error).__name__}): install the extra, as in uv sync "
-            "--extra video, and set MUJOCO_GL=egl (Debian's libegl1) or osmesa (libosmesa6)."
+            f"video cannot be made here ({type(error).__name__}): run uv sync --extra video, and "
+            "set MUJOCO_GL to egl (Debian's libegl1) or osmesa (libosmesa6)."
         ) from None
 
 

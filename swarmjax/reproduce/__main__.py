@@ -67,9 +67,9 @@ def main(arguments: Sequence[str]) -> int:
                 break
     if stop.asked:
         missing = len(set(given.arms) - reproduce_rows.summaries(out).keys())
-        done = f"{missing} of {len(made)} arms to train" if missing else "all arms trained"
+        done = f"{missing} of {len(made)} arms left to train" if missing else "all arms trained"
         again = command.line("reproduce", f"resume={out}")
-        sys.stdout.write(f"stopped with {done}, saved; go on with: {again}\n")
+        sys.stdout.write(f"stopped and saved, with {done}; continue with: {again}\n")
         return stop.code or 0
     _judge(out, given)
     sys.stdout.write(f"done; the report is {page.write(out)}\n")
@@ -83,7 +83,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
         check_text("resume", given.resume)
         others = files.parse(ReproduceConfig, arguments).keys() - {"resume", "minutes"}
         if others:
-            raise ConfigError(f"{min(others)} cannot be given: resume takes minutes alone.")
+            raise ConfigError(f"{min(others)} cannot be given with resume: leave it out.")
         stored = reproduce_rows.read_facts(Path(given.resume))["settings"]
         more = {"resume": given.resume, "minutes": given.minutes}
         return section.build_stored(ReproduceConfig, stored | more, ""), Path(given.resume)
@@ -91,7 +91,7 @@ def _settings(arguments: Sequence[str]) -> tuple[ReproduceConfig, Path]:
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(
             f"out is {out}, which is not empty: give a new or an empty folder, or resume={out} to "
-            "go on with the reproduction in it."
+            "continue the reproduction in it."
         )
     return given, out
 
@@ -114,7 +114,7 @@ def _judge(out: Path, given: ReproduceConfig) -> None:
         if (arm, seed, stage, action) not in known
     ]
     with life.progress("reproduce") as progress:
-        bar = progress.add_task("policies judged", total=len(tasks))
+        bar = progress.add_task("policies evaluated", total=len(tasks))
         for row in trials.work(judge.judge, tasks, min(provenance.cores(), len(tasks))):
             rows.append(row)
             progress.advance(bar)

@@ -46,8 +46,8 @@ class ReproduceConfig(Section):
 
     def _check(self) -> None:
         if not self.arms:
-            raise ConfigError(f"arms is []: give some of {', '.join(ARMS)}.")
+            raise ConfigError(f"arms is []: give at least one of {', '.join(ARMS)}.")
         for arm in self.arms:
             first = arm.removesuffix("_expanded")
             if first not in self.arms:
-                raise ConfigError(f"arms names {arm}, but not {first}, which it continues.")
+                raise ConfigError(f"arms lists {arm}, which continues {first}: add {first}.")

@@ -119,7 +119,7 @@ def read(out: Path) -> Reproduction:
     settings = build(ReproduceConfig, facts["settings"], f"{out / FACTS}: settings.")
     finished = summaries(out)
     if not finished:
-        raise ConfigError(f"{out} holds no finished arm: continue the reproduction.")
+        raise ConfigError(f"{out} has no finished arm yet: continue it with resume={out}.")
     return Reproduction(
         settings=settings,
         versions=facts["versions"],
@@ -176,7 +176,7 @@ def read_rows(out: Path) -> list[Row]:
         return []
     rows = _read_object(path).get("rows")
     if not isinstance(rows, list) or not all(map(report_rows.MAP.fits, rows)):
-        raise ConfigError(f"{path} has no list of rows: remove it to judge again.")
+        raise ConfigError(f"{path} has no list of rows: delete this file to evaluate again.")
     for number, row in enumerate(rows, 1):
         where = f"{path}, row {number},"
         report_rows.check(row, ("seed",), report_rows.COUNT, where)
@@ -210,7 +210,7 @@ def _read_logs(run: Path, seeds: Sequence[int]) -> tuple[RunLog, ...]:
     for seed, rows in by_seed.items():
         if not rows:
             raise ConfigError(
-                f"{run / EPISODES} has no whole episode of seed {seed}: give a larger budget."
+                f"{run / EPISODES} has no complete episode of seed {seed}: give a larger budget."
             )
     return tuple(_log(by_seed[seed]) for seed in seeds)
 
@@ -245,7 +245,7 @@ def _read_judged(
         for seed in seeds:
             if (arm, stage, action, seed) not in rows:
                 raise ConfigError(
-                    f"{out / EVALUATION} has no row of arm {arm}, seed {seed} on {stage} with "
+                    f"{out / EVALUATION} has no row for arm {arm}, seed {seed}, stage {stage} and "
                     f"{action} actions."
                 )
         of_arm = [rows[arm, stage, action, seed] for seed in seeds]

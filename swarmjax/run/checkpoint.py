@@ -252,9 +252,9 @@ def find(run: Path, update: int | None = None) -> Kept:
     """
     there = steps(run)
     if not there:
-        raise CheckpointError(f"{run} holds no checkpoints: give a run directory that has some.")
+        raise CheckpointError(f"{run} has no checkpoints: give a run directory that has some.")
     if update is not None and update not in there:
-        raise CheckpointError(f"{run} has no checkpoint of update {update}: it has {there}.")
+        raise CheckpointError(f"{run} has no checkpoint of update {update}: give one of {there}.")
     skipped, owner = [], _owner(run)
     for step in there if update is None else [update]:
         try:
@@ -265,7 +265,7 @@ def find(run: Path, update: int | None = None) -> Kept:
             skipped.append(f"checkpoint {step} of {run} cannot be used ({reason})")
         else:
             return Kept(leaves, step, skipped, meta["logs"])
-    raise CheckpointError(f"{run} has no sound checkpoint: {'; '.join(skipped)}.")
+    raise CheckpointError(f"{run} has no usable checkpoint: {'; '.join(skipped)}.")
 
 
 def _read(folder: Path) -> tuple[Leaves, dict[str, Any]]:

@@ -84,7 +84,7 @@ def _lock(run: Path, held: contextlib.ExitStack) -> None:
         file.seek(0)
         holder = file.readline().strip() or "another process"
         raise ConfigError(
-            f"run.dir is {run}, which {holder} is writing: wait for its end, or give another "
+            f"run.dir is {run}, but {holder} is writing to it: wait for its end, or give another "
             "directory."
         ) from None
     with contextlib.suppress(OSError):  # a full disk; the lock works without a name
@@ -232,8 +232,8 @@ def cut(path: Path, length: int) -> None:
         file.seek(max(0, length - 1))
         if found < length or (length and file.read(1) != b"\n"):
             raise CheckpointError(
-                f"{path} has {found} bytes, but its checkpoint counts {length} bytes of whole "
-                "lines: put the file back, or delete it to go on without its rows."
+                f"{path} has {found} bytes, but its checkpoint recorded {length} bytes of complete "
+                "lines: restore the file, or delete it to continue without its rows."
             )
         file.truncate(length)
 
@@ -260,7 +260,7 @@ def read_rows(path: Path, length: int | None) -> list[Row]:
             row = None
         if not isinstance(row, dict):
             raise CheckpointError(
-                f"{path} is damaged at line {number}: put the file back, or delete it to go on "
+                f"{path} is damaged at line {number}: restore the file, or delete it to continue "
                 "without its rows."
             )
         rows.append(row)

@@ -189,6 +189,6 @@ def _check_devices(settings: TrainConfig) -> None:
     found = jax.device_count()
     if settings.devices != found:
         raise ConfigError(
-            f"devices is {settings.devices}, but the {count()} processes of the run have {found}: "
-            f"give devices={found}."
+            f"devices is {settings.devices}, but the {count()} processes of the run have {found} "
+            f"devices: give devices={found}."
         )

@@ -60,7 +60,7 @@ def read_config(run: Path) -> dict:
     path = run / CONFIG
     check_text("the run directory", str(run))
     if not path.exists():
-        raise ConfigError(f"{run} is no run directory: it has no {CONFIG}.")
+        raise ConfigError(f"{run} is not a run directory: it has no {CONFIG}.")
     found = reading.read_json(path)
     if not isinstance(found, dict):
         raise ConfigError(f"{path} is not a run's config: it holds no JSON object.")
@@ -107,12 +107,12 @@ def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
     """Returns the stages that `curriculum.axes` makes out of a single stage."""
     if len(stages) > 1:
         raise ConfigError(
-            f"curriculum.axes needs one stage, but stage names {len(stages)}: give one, as in "
-            f"stage={stages[-1]['name']}."
+            f"curriculum.axes needs one stage, but stage lists {len(stages)}: give a single stage, "
+            f"as in stage={stages[-1]['name']}."
         )
     if not isinstance(along, Mapping):
         raise ConfigError(
-            f"curriculum.axes is {show(along)}: give values by name, as in "
+            f"curriculum.axes is {show(along)}: give the values of each axis, as in "
             "curriculum.axes.robots=[2,5,10]."
         )
     return axes.expand(stages[0], along)
@@ -194,8 +194,8 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
         if not _may_change(key):
             allowed = ", ".join(_RESUME_KEYS)
             raise ConfigError(
-                f"{key}={show(value, quote='')} cannot be given: resume keeps the rest of the "
-                f"stored run and takes {allowed} only."
+                f"{key}={show(value, quote='')} cannot be given: a resumed run keeps its settings, "
+                f"and only {allowed} may change."
             )
     given = files.nest(words)
     kept = to_dict(from_stored(stored, "stored "))
@@ -203,8 +203,8 @@ def load_resume(stored: Mapping[str, Any], overrides: Sequence[str]) -> TrainCon
     here = given.get("resume") or typed.get("dir")
     if typed.get("dir") and Path(typed["dir"]) != Path(here):
         raise ConfigError(
-            f"run.dir is {show(typed['dir'])}, but resume is {show(here)}, and a run goes on in "
-            "its own directory: leave run.dir out."
+            f"run.dir is {show(typed['dir'])}, but resume is {show(here)}, and a resumed run "
+            "continues in its own directory: leave run.dir out."
         )
     run = kept["run"] | {"stop_after": None, "distributed": False} | typed | {"dir": here}
     devices = given.get("devices", kept["devices"])
@@ -248,7 +248,7 @@ def _go_on_or_begin(words: Sequence[str], stages: Sequence[dict[str, Any]] | Non
     """Makes the configuration for `resume=auto`: it resumes the run in `run.dir` or begins one."""
     typed = load_train(words, stages=stages)
     if typed.run.dir is None:
-        raise ConfigError("resume is auto, but there is no run.dir: give run.dir=DIR with it.")
+        raise ConfigError("resume is auto, but run.dir is missing: give run.dir=DIR too.")
     run = Path(typed.run.dir)
     if not (run / CONFIG).exists():
         return typed
@@ -271,8 +271,8 @@ def _check_unchanged(run: Path, typed: Mapping[str, Any], stored: Mapping[str, A
     )
     changed = [key for key in mine if mine[key] != its.get(key)]
     if changed:
-        shown = ", ".join(f"{k} is {show(mine[k])} and not {show(its.get(k))}" for k in changed[:3])
+        shown = ", ".join(f"{k} is {show(mine[k])}, not {show(its.get(k))}" for k in changed[:3])
         raise ConfigError(
-            f"resume is auto, but {run} holds a run with other settings: {shown}. A resumed run "
-            f"may change only {', '.join(_RESUME_KEYS)}: give its own settings, or another run.dir."
+            f"resume is auto, but {run} holds a run with other settings: {shown}; only "
+            f"{', '.join(_RESUME_KEYS)} may change, so use that run's settings or another run.dir."
         )

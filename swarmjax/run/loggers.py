@@ -86,4 +86,4 @@ class Guarded:
         """Stops calling the logger; the first time, also reports why."""
         if not self._is_lost:
             self._is_lost = True
-            sys.stderr.write(f"swarmjax: {self._logger.name} is not written from here on: {why}.\n")
+            sys.stderr.write(f"swarmjax: {self._logger.name} gets no more data: {why}.\n")

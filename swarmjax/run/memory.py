@@ -53,7 +53,7 @@ def check(settings: TrainConfig, needed: int) -> None:
     fits = max(int(MARGIN * settings.arenas * available / needed) // fewest, 1) * fewest
     raise ConfigError(
         f"arenas is {settings.arenas} and seeds is {settings.seeds}, which needs {_gib(needed)} of "
-        f"memory, and there is {_gib(available)}: give at most about {fits} arenas, or fewer seeds."
+        f"memory, but {_gib(available)} is there: give at most about {fits} arenas, or fewer seeds."
     )
 
 

@@ -36,7 +36,7 @@ def _read(cls: type[Section], choice: str, extended_by: Sequence[Path] = ()) -> 
     path = files.named_path("recipes", choice, "recipe")
     chain = [*extended_by, path.resolve()]
     if chain[-1] in extended_by:
-        raise ConfigError(f"{path} extends itself: remove the key recipe from one of the files.")
+        raise ConfigError(f"{path} extends itself: remove the key `recipe` from one file.")
     settings = reading.read_yaml(path)
     base = settings.pop("recipe", None)
     words = files.shared_words(cls, settings, path)
@@ -44,7 +44,7 @@ def _read(cls: type[Section], choice: str, extended_by: Sequence[Path] = ()) -> 
         files.parse(cls, words)
         if not isinstance(base, str | None):
             raise ConfigError(
-                f"recipe is {show(base)}: give the name of a recipe, or a file .yaml."
+                f"recipe is {show(base)}: give the name of a recipe, or the path of a .yaml file."
             )
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None

@@ -74,7 +74,7 @@ class TrainConfig(ProgramConfig):
         if self.seed + self.seeds - 1 > MAX_COUNT:
             raise ConfigError(
                 f"seed is {self.seed}, but seeds is {self.seeds} and the last seed may be at most "
-                f"{MAX_COUNT}: give at most {MAX_COUNT - self.seeds + 1}."
+                f"{MAX_COUNT}: give a seed of at most {MAX_COUNT - self.seeds + 1}."
             )
         self._check_stages()
         self._check_threshold()
@@ -94,12 +94,12 @@ class TrainConfig(ProgramConfig):
         names, along = self.stage_names, self.curriculum.axes
         if along and (count := math.prod(len(each) + 1 for each in along.values())) != len(names):
             raise ConfigError(
-                f"curriculum.axes makes {count} stages, but stage names {len(names)}: leave one of "
-                "them out."
+                f"curriculum.axes makes {count} stages, but stage lists {len(names)}: leave out "
+                "curriculum.axes or stage."
             )
         for name in names:
             if names.count(name) > 1:
-                raise ConfigError(f"stage names {name} more than once: give each stage once.")
+                raise ConfigError(f"stage lists {name} more than once: give each stage once.")
         for stage in self.stage:
             where = "stage." if len(names) == 1 else f"stage {stage.name}: "
             for key, least in (("robots", 1), ("obstacles", 0)):
@@ -140,8 +140,8 @@ class TrainConfig(ProgramConfig):
             )
         if self.devices > 1 and self.seeds_by == "cores":
             raise ConfigError(
-                f"seeds_by is cores, but devices is {self.devices}: give vmap or devices, or "
-                "devices=1."
+                f"seeds_by is cores, but devices is {self.devices}: give seeds_by=vmap, "
+                "seeds_by=devices or devices=1."
             )
         if self.seeds_by == "devices" and self.seeds % self.devices:
             raise ConfigError(
@@ -155,8 +155,8 @@ class TrainConfig(ProgramConfig):
         if self.arenas > most:
             raise ConfigError(
                 f"arenas is {self.arenas}, but robot steps are counted in 32 bits, which is enough "
-                f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: "
-                f"give at most {most}."
+                f"for {most} arenas with {self.sim.robots} robots and {steps} control steps: give "
+                f"at most {most} arenas."
             )
 
     def _check_budget(self) -> None:
@@ -169,8 +169,8 @@ class TrainConfig(ProgramConfig):
         most = MAX_COUNT // (self.algo.epochs * self.algo.num_minibatches) * update
         if self.budget >= most + update:
             raise ConfigError(
-                f"budget is {self.budget}, but gradient steps are counted in 32 bits: give at most "
-                f"{most}, more arenas, or a longer algo.rollout_length."
+                f"budget is {self.budget}, but gradient steps are counted in 32 bits: give a "
+                f"budget of at most {most}, more arenas, or a longer algo.rollout_length."
             )
 
 

@@ -102,9 +102,9 @@ def _watch(read: int) -> None:
                 continue
             if code is None:
                 code, since = CODES[signal.Signals(number[0])], time.monotonic()
-                _say("stopping after the current call, to save; a second signal stops at once")
+                _say("saving and stopping after the current updates; a second signal stops at once")
             elif time.monotonic() > since + ONE_S:
-                _say("stopped at once; what was saved before is kept")
+                _say("stopped at once; everything saved before is kept")
                 os._exit(code)
 
 

@@ -91,8 +91,8 @@ def carry(source: Kept, state: TrainState, settings: TrainConfig) -> TrainState:
 
 def _refused(settings: TrainConfig, error: Exception) -> ConfigError:
     return ConfigError(
-        f"init_from is {show(settings.init_from)}: it takes the directory of a run with a sound "
-        f"checkpoint, but {error}"
+        f"init_from is {show(settings.init_from)}, which must be the directory of a run with a "
+        f"usable checkpoint, but {error}"
     )
 
 
@@ -102,22 +102,22 @@ def _check_alike(settings: TrainConfig, stored: TrainConfig) -> None:
     if stored.seeds not in (1, settings.seeds):
         raise ConfigError(
             f"init_from is {given}, a run of {stored.seeds} seeds, but seeds is {settings.seeds}: "
-            f"give seeds={stored.seeds}, or a run of one seed."
+            f"give seeds={stored.seeds}, or init_from a run of one seed."
         )
     pieces, kinds = extension.load(settings.extensions), ["observation", "network"]
     extension.check_needs(stored.pieces, pieces, settings.init_from or "", kinds)
     sensors = [len(each.robot.sensor_poses) for each in (stored, settings)]
     if sensors[0] != sensors[1]:
         raise ConfigError(
-            f"init_from is {given}, whose robot has {sensors[0]} sensors, but here robot has "
-            f"{sensors[1]}: give a robot with as many, or another run."
+            f"init_from is {given}, a run whose robot has {sensors[0]} sensors, but the robot of "
+            f"this run has {sensors[1]}: give a robot with {sensors[0]} sensors, or another run."
         )
     mine, theirs = _networks(settings), _networks(stored)
     for key, held in theirs.items():
         if held != mine.get(key, held):
             raise ConfigError(
-                f"init_from is {given}, whose {key} is {held}, but here it is {mine[key]}: give "
-                f"{key}={held}, or another run."
+                f"init_from is {given}, a run with {key}={held}, but here {key} is {mine[key]}: "
+                f"give {key}={held}, or another run."
             )
 
 

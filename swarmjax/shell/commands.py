@@ -25,14 +25,14 @@ COMMANDS: dict[str, Command] = {
     "probe": Command(
         "swarmjax.run.settings:ProbeConfig", "Count what an untrained swarm reaches by chance."
     ),
-    "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Judge policies in MuJoCo C."),
+    "evaluate": Command("swarmjax.evaluate.config:EvaluateConfig", "Test policies in MuJoCo C."),
     "replay": Command("swarmjax.replay.config:ReplayConfig", "Show episodes on a page."),
     "report": Command("swarmjax.report.config:ReportConfig", "Draw the results of runs."),
     "export": Command(
         "swarmjax.export.config:ExportConfig", "Write a policy for ONNX, C or Webots."
     ),
     "reproduce": Command(
-        "swarmjax.reproduce.config:ReproduceConfig", "Repeat the study of the paper."
+        "swarmjax.reproduce.config:ReproduceConfig", "Reproduce the study of the paper."
     ),
     "watch": Command("swarmjax.watch.config:WatchConfig", "Follow a run on a page."),
 }

@@ -147,29 +147,29 @@ class RobotConfig(Section):
             value = getattr(self, key)
             if value >= most * hull:
                 raise ConfigError(
-                    f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels lie "
-                    f"inside the hull: give less than {show(most * hull)}."
+                    f"{key} is {show(value)}, but hull_radius is {show(hull)} and the wheels must "
+                    f"lie inside the hull: give less than {show(most * hull)}."
                 )
         reach = self.wheel_radius * self.max_wheel_speed
         if self.wheel_limit == "refuse" and self.max_speed > reach * (1 + _ROUNDING):
             raise ConfigError(
                 f"max_speed is {show(self.max_speed)}, but wheels of {show(self.wheel_radius)} m "
-                f"at {show(self.max_wheel_speed)} rad/s reach {show(reach)} m/s: give at most "
-                "that, or wheel_limit=clip, with which the robot drives no faster."
+                f"at {show(self.max_wheel_speed)} rad/s reach only {show(reach)} m/s: give at most "
+                f"{show(reach)}, or wheel_limit=clip, which limits the speed to that."
             )
         sensors.check_poses(self.sensor_poses, hull, self.sensor_range)
         sensors.check_response(self.sensor_response)
         if self.mass <= 2 * self.wheel_mass:
             raise ConfigError(
-                f"mass is {show(self.mass)}, but wheel_mass is {show(self.wheel_mass)} and the "
-                f"mass includes two wheels: give more than {show(2 * self.wheel_mass)}."
+                f"mass is {show(self.mass)}, but wheel_mass is {show(self.wheel_mass)} and mass "
+                f"includes both wheels: give more than {show(2 * self.wheel_mass)}."
             )
         # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
         # axle.
         wheels = 2 * (self.wheel_inertia[2] + self.wheel_mass * (0.5 * self.track) ** 2)
         if self.body == "wheeled" and self.yaw_inertia <= wheels:
             raise ConfigError(
-                f"yaw_inertia is {show(self.yaw_inertia)}, but body is wheeled and its wheels "
+                f"yaw_inertia is {show(self.yaw_inertia)}, but body is wheeled, and the wheels "
                 f"alone have {show(wheels)}: give more than {show(wheels)}."
             )
 

@@ -59,7 +59,7 @@ def resolve_impl(impl: str) -> str:
     installed = importlib.util.find_spec("warp") is not None
     if impl == "warp" and not installed:
         raise ConfigError(
-            "sim.impl is warp, but Warp is not installed: give jax or auto, or install extra gpu."
+            "sim.impl is warp, but Warp is not installed: install extra gpu, or give sim.impl=jax."
         )
     if impl != "auto":
         return impl
@@ -90,8 +90,8 @@ def resolve_solver(solver: str, impl: str, body: str, robots: int, *, rubs: bool
     available = body == "planar" or (impl == "warp" and robots <= MOST_WHEELED and not rubs)
     if solver == "swarm" and not available:
         raise ConfigError(
-            f"sim.solver is swarm, but robot.body is {body}: give mjx or auto, or sim.impl=warp, "
-            f"at most {MOST_WHEELED} robots and no robot.hull_friction."
+            f"sim.solver is swarm, but robot.body is {body}: give sim.solver=mjx or auto, or give "
+            f"sim.impl=warp with at most {MOST_WHEELED} robots and without robot.hull_friction."
         )
     if solver != "auto":
         return solver

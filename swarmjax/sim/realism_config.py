@@ -116,6 +116,6 @@ class RealismConfig(Section):
             value = getattr(self, key)
             if value is not None:
                 raise ConfigError(
-                    f"{key} is {show(value)}, but infrared is ideal and has no counts: give null, "
-                    "or infrared=webots or infrared=real."
+                    f"{key} is {show(value)}, but infrared is ideal and has no sensor counts: give "
+                    f"null for {key}, or give infrared=webots or real."
                 )

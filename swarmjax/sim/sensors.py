@@ -43,14 +43,14 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
         away = math.hypot(*pose[:2])
         if away > hull_radius + _ROUNDING:
             raise ConfigError(
-                f"sensor_poses holds {show(pose)} for sensor {i}, {away:.6f} m from the "
-                f"middle, but hull_radius is {show(hull_radius)}: move the sensor to at most that, "
-                "rounded towards the middle, or give a larger hull."
+                f"sensor_poses puts sensor {i} at {show(pose)}, {away:.6f} m from the middle, but "
+                f"hull_radius is {show(hull_radius)}: move the sensor to at most "
+                f"{show(hull_radius)} m, rounded towards the middle, or give a larger hull."
             )
         if abs(pose[2]) > MOST_YAW:
             raise ConfigError(
-                f"sensor_poses holds {show(pose)} for sensor {i}, but its yaw, the last number, is "
-                f"in radians: give {-MOST_YAW:.4f} to {MOST_YAW:.4f}."
+                f"sensor_poses holds {show(pose)} for sensor {i}, whose last number is its yaw in "
+                f"radians: give a yaw of {-MOST_YAW:.4f} to {MOST_YAW:.4f}."
             )
         within = way_to_hull(pose, hull_radius)
         if within >= reach:

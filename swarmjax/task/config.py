@@ -128,8 +128,8 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
     """
     if realism.infrared == "real" and robot.sensor_poses != epuck.SENSOR_POSES:
         raise ConfigError(
-            "realism.infrared is real, which repeats the measured sensors of the e-puck, but "
-            "robot.sensor_poses are others: give realism.infrared=webots, with "
+            "realism.infrared is real, which uses the measured sensors of the e-puck, but "
+            "robot.sensor_poses has other sensors: give realism.infrared=webots with "
             "robot.sensor_response, or realism.infrared=ideal."
         )
     hull, seconds = robot.hull_radius, steps * task.control_step
@@ -140,7 +140,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
         if value is not None and value[1] >= most:
             raise ConfigError(
                 f"realism.{key} is {show(value)}, but robot.hull_radius is {show(hull)} and the "
-                f"wheels lie inside the hull: give less than {show(most)}."
+                f"wheels must lie inside the hull: give less than {show(most)}."
             )
     for key, value, length, unit in (
         ("action_latency", realism.action_latency, steps, "control steps"),

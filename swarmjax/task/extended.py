@@ -79,8 +79,8 @@ def redraw(piece: LevelDrawing, drawn: Level) -> Level:
     found = level.park(Level(*(np.asarray(field) for field in own)), np)
     if not np.array_equal(found.obstacle[:, 3:], drawn.obstacle[:, 3:]):
         raise ConfigError(
-            f"{label(piece)} changes the half edges of obstacles: leave obstacle[:, 3:] as it is, "
-            "and give the stage's obstacle_size."
+            f"{label(piece)} changes the sizes of obstacles: leave obstacle[:, 3:] as it is, and "
+            "set the stage's obstacle_size."
         )
     return found
 

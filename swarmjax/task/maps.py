@@ -123,8 +123,8 @@ def _check_text(rows: Sequence[str]) -> None:
                 )
     if max(len(rows), len(rows[0])) > MOST_CELLS:
         raise ConfigError(
-            f"map has {len(rows)} rows of {len(rows[0])} characters: give at most {MOST_CELLS} of "
-            "each, and larger cells."
+            f"map has {len(rows)} rows of {len(rows[0])} characters: give at most {MOST_CELLS} "
+            f"rows of {MOST_CELLS} characters, and larger cells."
         )
 
 
@@ -151,8 +151,8 @@ def _check_reach(
     """Refuses a target that no sequence of steps between adjacent cells can reach."""
     if bool(starts) != bool(targets) or not (starts or pairs):
         raise ConfigError(
-            f"map has {len(starts)} cells of S and {len(targets)} of T: give both, or a letter for "
-            "each robot."
+            f"map has {len(starts)} cells with S and {len(targets)} with T: give both, or a letter "
+            "for each robot."
         )
     from scipy import ndimage  # slow to import, and few stages have a map
 

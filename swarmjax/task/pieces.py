@@ -82,6 +82,6 @@ def _check_named(key: str, name: str, there: dict[str, Any]) -> None:
     if there:
         raise ConfigError(f"{key} names {show(name)}: give one of {', '.join(there)}.")
     raise ConfigError(
-        f"{key} names {show(name)}, which is not part of swarmjax: give extensions=FILE, the file "
-        "that defines it."
+        f"{key} names {show(name)}, which is not part of swarmjax: add extensions=FILE, the Python "
+        f"file that defines {show(name)}."
     )

@@ -56,8 +56,8 @@ def must_check(stage: StageConfig, hull: float) -> bool:
     """
     if stage.gap is not None and np.min(stage.gap) < 2 * hull:
         raise ConfigError(
-            f"stage {stage.name}: gap is {show(stage.gap)}, but robot.hull_radius is {show(hull)} "
-            f"and no such robot fits through: give more than {show(2 * hull)}."
+            f"stage {stage.name}: gap is {show(stage.gap)}, but robot.hull_radius is {show(hull)}, "
+            f"so that no robot fits through: give more than {show(2 * hull)}."
         )
     if stage.map or stage.kind is not None:
         return True
@@ -89,8 +89,8 @@ def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
         problem = "a robot starts within its target"
     if problem:
         raise ConfigError(
-            f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots, since "
-            f"{problem}: give fewer robots, or more space."
+            f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots, "
+            f"because {problem}: give fewer robots, or more space."
         )
 
 
@@ -118,8 +118,8 @@ def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[Lev
     levels = _levels(replace(stage, distance=None), own, drawings)
     if not any(ways.starts(each, ends, *sizes, np)[1].any() for each in levels):
         raise ConfigError(
-            f"stage {stage.name}: distance is {show(stage.distance)}, but in {_TRIED} levels no "
-            "robot has a way of this length to its target: give less."
+            f"stage {stage.name}: distance is {show(stage.distance)}, but in {_TRIED} sampled "
+            "levels no robot has a path of this length to its target: give a smaller distance."
         )
 
 

@@ -115,8 +115,8 @@ def _drawing(stage: StageConfig, drawings: Sequence[str]) -> int:
     if stage.level not in drawings:
         known = ", ".join([*BUILT_IN, *drawings])
         raise ConfigError(
-            f"stage {stage.name}: level is {show(stage.level)}: give one of {known}, or "
-            "extensions=FILE, a file that defines it."
+            f"stage {stage.name}: level is {show(stage.level)}: give one of {known}, or add "
+            "extensions=FILE, the Python file that defines this level."
         )
     return 1 + list(drawings).index(stage.level)
 

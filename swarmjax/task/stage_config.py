@@ -64,8 +64,8 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
     found = maps.read(rows, cell)
     if len(found.wall) > _MOST_OBSTACLES:
         raise ConfigError(
-            f"map has walls of {len(found.wall)} rectangles: give at most {_MOST_OBSTACLES}; "
-            "straight walls need the fewest rectangles."
+            f"map has walls of {len(found.wall)} rectangles: give walls of at most "
+            f"{_MOST_OBSTACLES}; straight walls need the fewest rectangles."
         )
     return found
 
@@ -164,8 +164,8 @@ class StageConfig(Section):
             raise ConfigError(f"side is {show(self.side)}, but level is fixed: give one number.")
         if self.distance is not None:
             raise ConfigError(
-                f"distance is {show(self.distance)}, but level is fixed, whose starts are given: "
-                "leave distance out."
+                f"distance is {show(self.distance)}, but level is fixed, which sets the starts "
+                "itself: leave distance out."
             )
         most = {
             "robots": fixed_level.most_robots(self.side),
@@ -189,7 +189,7 @@ class StageConfig(Section):
         if self.robots < pairs or (self.robots > pairs and not areas):
             without = "" if areas else " and no areas S and T"
             raise ConfigError(
-                f"robots is {self.robots}, but map has letters for {pairs}{without}: give "
+                f"robots is {self.robots}, but map has letters for {pairs} robots{without}: give "
                 f"{'at least ' if areas else ''}{pairs}."
             )
 
@@ -201,7 +201,7 @@ class StageConfig(Section):
             given = getattr(self, key)
             if given is not None and key not in (*needed, *optional):
                 raise ConfigError(
-                    f"{key} is {show(given)}, but level is {self.level}, which has none: leave "
+                    f"{key} is {show(given)}, but level is {self.level}, which has no {key}: leave "
                     f"{key} out."
                 )
             if given is None and key in needed:
@@ -215,7 +215,7 @@ class StageConfig(Section):
         if self.robots > layout.most_robots:
             raise ConfigError(
                 f"robots is {self.robots}, but level={self.level} has room for "
-                f"{layout.most_robots}: give at most that."
+                f"{layout.most_robots}: give at most {layout.most_robots}."
             )
         if self.level == "plots" and self.sides[0] < (least := smallest_plots(self)):
             raise ConfigError(

@@ -56,7 +56,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
       ConfigError: there is no file of this name, or the file names several stages.
     """
     if _is_sequence(choice, key):
-        raise ConfigError(f"{key} is {choice}, which names several stages: give single stages.")
+        raise ConfigError(f"{key} is {choice}, a curriculum of several stages: list single stages.")
     return _named(files.read_choice("stage", choice), choice)
 
 
@@ -135,4 +135,4 @@ def _check_name(stage: dict[str, Any], choice: str) -> None:
     name = name_of(choice)
     given = stage.get("name", name)
     if given != name:
-        raise ConfigError(f"stage.name is {show(given)} in {name}.yaml: give the file's name.")
+        raise ConfigError(f"stage.name is {show(given)} in {name}.yaml: give '{name}'.")

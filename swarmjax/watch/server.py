@@ -41,8 +41,8 @@ class Server(ThreadingHTTPServer):
             super().__init__((ADDRESS, port), Answers)
         except OSError as error:
             raise ConfigError(
-                f"port is {port}, which is not available ({error.strerror}): give another, or 0 "
-                "for any free port."
+                f"port is {port}, which is not available ({error.strerror}): give another port, or "
+                "0 for any free port."
             ) from None
 
     def handle_error(self, request: object, client_address: object) -> None:

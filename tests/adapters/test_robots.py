@@ -61,7 +61,9 @@ def test_robots_follow_the_course(swarm: Swarm, course: Course) -> None:
 
 
 def test_several_arenas_are_refused(swarm: Swarm) -> None:
-    with pytest.raises(ValueError, match=r"^arenas is 4, but this adapter steps one: make_env"):
+    with pytest.raises(
+        ValueError, match=r"^arenas is 4, but this adapter steps a single arena: give arenas=1"
+    ):
         line_up_arena(swarm)
 
 
@@ -91,5 +93,5 @@ def test_a_right_action_is_not() -> None:
 def test_a_library_that_is_missing_or_too_old(module: str, name: str | None, reason: str) -> None:
     with pytest.raises(ImportError) as caught:
         library.find(module, "extra", name)
-    expected = f"{module} cannot be used here ({reason}): pip install swarmjax[extra]."
+    expected = f"{module} cannot be used here ({reason}): run pip install swarmjax[extra]."
     assert str(caught.value) == expected

@@ -44,8 +44,8 @@ def test_groups_and_keys_in_any_order():
         ),
         (
             ["stage.sequence=[s1]", "stage.sequence.a.b=1"],
-            "stage.sequence.a.b is not a key, since stage.sequence is ['s1']: leave one of them "
-            "out.",
+            "stage.sequence.a.b cannot be set if stage.sequence is ['s1']: leave out one of the "
+            "two.",
         ),
     ],
 )

@@ -20,17 +20,17 @@ BOMB = "\n".join(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        (BOMB, "it has the alias *a0: write the value itself"),
-        ("a: &a [*a]", "it has the alias *a"),
+        (BOMB, "replace the YAML alias *a0 by its value"),
+        ("a: &a [*a]", "replace the YAML alias *a"),
         ("[" + "1," * 10_001 + "]", "has more than 10000 values"),
         ("a: " + "[" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("[" * 100_000 + "]" * 100_000, "lists or mappings are nested more than 32 deep"),
         ("a: " + "9" * 4900, "Exceeds the limit (4300 digits)"),
-        ("a: 1\na: 2\n", "key 'a' is there twice"),
+        ("a: 1\na: 2\n", "key 'a' is given twice"),
         ("{[1]: 2}", "key [1] is not text"),
         (
             "a: !!python/object/apply:os.system [ls]",
-            "it has the tag 'tag:yaml.org,2002:python/object/apply:os.system': remove it",
+            "remove the YAML tag 'tag:yaml.org,2002:python/object/apply:os.system'",
         ),
         ("#" * 2**20 + "\n", "more than 1048576 bytes"),
     ],
@@ -67,7 +67,7 @@ def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
 
 @pytest.mark.parametrize("tag", ["!!timestamp", "!!set", "!!binary", "!!str", "!own", "!"])
 def test_a_tag_is_refused(tag: str) -> None:
-    assert "it has the tag '" in refusal(reading.parse_yaml, f"a: {tag} x", "")
+    assert "remove the YAML tag '" in refusal(reading.parse_yaml, f"a: {tag} x", "")
 
 
 @pytest.mark.parametrize(
@@ -90,12 +90,12 @@ def test_json_that_stands_for_too_much_is_refused(tmp_path: Path, text: str, par
 def test_a_pipe_is_refused_without_waiting(tmp_path: Path) -> None:
     path = tmp_path / "pipe.yaml"
     os.mkfifo(path)
-    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is no plain file."
+    assert refusal(reading.read_text, path) == f"{path} cannot be read: it is not a regular file."
 
 
 @pytest.mark.parametrize("path", [Path("/dev/zero"), Path("/tmp")])
 def test_what_is_no_plain_file_is_refused(path: Path) -> None:
-    assert refusal(reading.read_bytes, path) == f"{path} cannot be read: it is no plain file."
+    assert refusal(reading.read_bytes, path) == f"{path} cannot be read: it is not a regular file."
 
 
 def test_text_that_is_no_unicode_is_refused(tmp_path: Path) -> None:

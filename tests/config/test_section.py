@@ -157,14 +157,15 @@ def test_stages_of_a_curriculum_are_named_in_sentences():
     )
     assert refusal(build, TrainConfig, {"stage": [bad]}) == "stage.robots is 0: give 1 to 1024."
     assert refusal(build, TrainConfig, {"stage": [good, 3]}) == (
-        "stage 1 is 3: give its keys, such as stage 1: name."
+        "stage 1 is 3: give one of its keys, such as stage 1: name."
     )
 
 
 def test_a_missing_key_is_named():
-    assert refusal(files.load, WatchConfig, []) == "run is missing and has no default: give it."
+    said = "run is missing and has no default: give it a value."
+    assert refusal(files.load, WatchConfig, []) == said
     assert refusal(build, TrainConfig, {"stage": [{"name": "s", "side": 1.0}]}) == (
-        "stage.robots is missing and has no default: give it."
+        "stage.robots is missing and has no default: give it a value."
     )
 
 

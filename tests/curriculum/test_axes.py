@@ -49,20 +49,26 @@ def test_a_stage_waits_for_those_one_step_easier() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["curriculum.axes.speed=[1]"], "curriculum.axes.speed is no axis: give one of robots, "),
+        (
+            ["curriculum.axes.speed=[1]"],
+            "curriculum.axes.speed is not an axis: give one of robots, ",
+        ),
         (["curriculum.axes.robots=[]"], "curriculum.axes.robots is []: give a list of values"),
         (["curriculum.axes.robots=2"], "curriculum.axes.robots is 2: give a list of values"),
-        (["curriculum.axes=2"], "curriculum.axes is 2: give values by name"),
+        (["curriculum.axes=2"], "curriculum.axes is 2: give the values of each axis"),
         (["curriculum.axes.distance=[0.1,any]"], "curriculum.axes.distance holds 'any': give num"),
         (["curriculum.axes.robots=[true]"], "curriculum.axes.robots holds true: give numbers"),
         (["curriculum.axes.robots=[2,2]"], "curriculum.axes.robots holds 2 more than once"),
-        (["curriculum.axes.robots=[2,5]"], "but stage.robots is 5: leave the stage's own value"),
+        (["curriculum.axes.robots=[2,5]"], "but stage.robots is 5: leave out this value"),
         (["curriculum.axes.robots=[2.5]"], "robots is 2.5: give a whole number"),
         (["curriculum.axes.robots=[9]", "sim.max_robots=5"], "but sim.max_robots is 5"),
-        (["curriculum.axes.gap=[0.1]"], "gap is 0.1, but level is random, which has none"),
+        (["curriculum.axes.gap=[0.1]"], "gap is 0.1, but level is random, which has no gap"),
         (["curriculum.axes.distance=[0.3,[0.5,0.4]]"], "give the lower number first"),
         (["curriculum.axes.distance=[100]"], "distance is 100: give 0.05 to 50"),
-        (["stage=curriculum", "curriculum.axes.robots=[2]"], "stage names 6: give one, as in "),
+        (
+            ["stage=curriculum", "curriculum.axes.robots=[2]"],
+            "stage lists 6: give a single stage, as in ",
+        ),
         (
             [f"curriculum.axes.{key}={[0.5 + i / 100 for i in range(8)]}" for key in ("side",)]
             + [f"curriculum.axes.distance={[0.1 + i / 100 for i in range(8)]}"],
@@ -81,5 +87,5 @@ def test_an_impossible_grid_is_one_sentence(words: list[str], message: str) -> N
 def test_a_stored_grid_that_lacks_a_stage_is_refused(config: TrainConfig) -> None:
     stored = to_dict(config)
     stored["stage"] = stored["stage"][1:]
-    with pytest.raises(ConfigError, match=r"curriculum.axes makes 6 stages, but stage names 5"):
+    with pytest.raises(ConfigError, match=r"curriculum.axes makes 6 stages, but stage lists 5"):
         from_stored(stored)

@@ -112,19 +112,22 @@ def _edit(name: str, index: Any, value: Any) -> Callable[[dict[str, Any]], None]
         (_set("meta", np.array("{")), "meta cannot be read as JSON"),
         (_meta(lambda m: m.update(format=1)), "meta.format is not 2"),
         (_meta(lambda m: m.pop("cells")), "meta.cells is null: give a list"),
-        (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells names one more than"),
+        (_meta(lambda m: m["cells"].append(m["cells"][0])), "meta.cells lists one more than"),
         (_meta(lambda m: m["cells"][0].update(x=1)), "meta.cells one: x is not a key"),
         (
             _meta(lambda m: m["cells"][0]["stage"].update(robots=0)),
             "meta.cells one: stage.robots is",
         ),
         (_meta(lambda m: m["cells"][0].update(seed=1)), "meta.cells one: seed is 1: give"),
-        (_meta(lambda m: m["cells"][0].update(digest="0" * 64)), "cell one has the digest "),
+        (
+            _meta(lambda m: m["cells"][0].update(digest="0" * 64)),
+            "the levels of cell one have the digest ",
+        ),
         (lambda a: a.pop("two/target"), "two/target is not finite float32 [2, 3, 2]."),
         (_set("one/seed", np.zeros(3, np.int32)), "one/seed is not finite uint32 [3]."),
         (_set("one/start", np.zeros((3, 2, 2), np.float32)), "one/start is not finite float32 "),
         (_edit("one/start", 0, np.nan), "one/start is not finite float32 [3, 2, 3]."),
-        (_edit("two/obstacle", (0, 0, 0), 0.1), "cell two has the digest "),
+        (_edit("two/obstacle", (0, 0, 0), 0.1), "the levels of cell two have the digest "),
     ],
 )
 def test_a_file_that_is_unsound_is_refused(
@@ -142,7 +145,7 @@ def test_a_file_that_is_unsound_is_refused(
 def test_a_file_that_is_compressed_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "levels.npz"
     np.savez_compressed(path, zeros=np.zeros(10_000))
-    assert "it unpacks to more than the file" in refusal(cells.read, path)
+    assert "it unpacks to more than its size" in refusal(cells.read, path)
 
 
 @settings(max_examples=150)
@@ -254,21 +257,21 @@ def test_swarms_are_as_dense_as_the_last_stage() -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("name: x\n", "cells is missing and has no default: give it."),
+        ("name: x\n", "cells is missing and has no default: give it a value."),
         (
             _text("name: a, stage: s9, seed: 1000000"),
-            "stage is 's9': give s6, the nearest, or one of ",
+            "stage is 's9': give s6 (the most similar name) or one of ",
         ),
         (
             _text("name: a, stage: worlds, seed: 1000000"),
-            "stage is worlds, which names several stages",
+            "stage is worlds, a curriculum of several stages",
         ),
         (_text("name: a, stage: s1, seed: 5"), "seed is 5: give 1000000 to 2147483647."),
         (_text("name: a, stage: s1, seed: 1000000, levels: 2, episodes: [1]"), "levels is 2, but"),
         (_text("name: a b, stage: s1, seed: 1000000"), "name is 'a b': give letters, digits"),
-        (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells names a more than once"),
+        (_text(*["name: a, stage: s1, seed: 1000000"] * 2), "cells lists a more than once"),
         (_text("name: a, stage: {robots: 2, side: 0.3}, seed: 1000000"), "stage.side is 0.3: "),
-        ("- 1\n", "is not a list of keys and values"),
+        ("- 1\n", "must hold keys"),
     ],
 )
 def test_a_suite_that_is_unsound_is_refused(tmp_path: Path, text: str, reason: str) -> None:
@@ -284,8 +287,8 @@ def test_a_digest_that_is_off_is_refused(tmp_path: Path) -> None:
     assert cells.draw(str(path)).cells[0].name == "here"
     path.write_text(_text(f"{cell}, digest: {'a' * 64}"))
     sentence = refusal(cells.draw, str(path))
-    assert sentence.startswith("cell here has the digest ")
-    assert "but aaaaaaaaaaaa... is recorded: the levels differ." in sentence
+    assert sentence.startswith("the levels of cell here have the digest ")
+    assert "but the suite records aaaaaaaaaaaa...: the levels have changed." in sentence
 
 
 def test_suites_are_for_robots_of_the_nominal_size() -> None:
@@ -301,6 +304,7 @@ def test_suites_are_for_targets_of_the_nominal_size() -> None:
         task = TaskConfig(target_radius=radius)
         settings_ = EvaluateConfig(policy="", stage=stage, task=task, suite="stages")
         sentence = refusal(cells.load, settings_)
-        assert (
-            sentence == f"task.target_radius is {radius}, but suites are drawn for 0.05: give that."
+        assert sentence == (
+            f"task.target_radius is {radius}, but the levels of suites are made for 0.05 m: "
+            "give 0.05."
         )

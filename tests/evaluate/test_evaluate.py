@@ -390,10 +390,13 @@ def wrong(tmp_path: Path) -> None:
     ("words", "sentence"),
     [
         (["policy=none.npz"], "none.npz "),
-        (["policy=no*.npz"], "policy is 'no*.npz', and 'no*.npz' matches no "),
+        (["policy=no*.npz"], "policy is 'no*.npz', but no file matches 'no*.npz'"),
         (["policy=policy.npz,p*.npz"], "policy is "),
-        (["policy=policy.npz", "stage=s7"], "stage is 's7': give s6, the nearest, or one of "),
-        ([], "policy is null and compare is null: give one of them"),
+        (
+            ["policy=policy.npz", "stage=s7"],
+            "stage is 's7': give s6 (the most similar name) or one of ",
+        ),
+        ([], "policy is null and compare is null: give exactly one of the two"),
         (["compare=policy.npz"], "compare is 'policy.npz': give two files"),
         (
             ["policy=policy.npz", "out=policy.npz/result.json"],
@@ -405,32 +408,36 @@ def wrong(tmp_path: Path) -> None:
         ),
         (
             ["policy=three.npz", "stage=s6"],
-            "three.npz holds a network for each of 3 robots, but stage s6 has 5: give a "
-            "shared policy, or a stage of 1 to 3.",
+            "three.npz holds a network for each of 3 robots, but stage s6 has 5 robots: give a "
+            "shared policy, or a stage with 1 to 3 robots.",
         ),
         (
             ["policy=other.npz", "stage=s1"],
-            "other.npz was trained on observations that differ from this robot's: its "
-            f"meta.observation.names is {observation.NAMES[0]}, ",
+            "other.npz was trained with observations that this robot does not have: the "
+            f"policy's meta.observation.names is {observation.NAMES[0]}, ",
         ),
         (
             ["policy=scaled.npz", "stage=s1"],
-            "scaled.npz was trained on observations that differ from this robot's: its "
-            "meta.observation.scale is 2.0, ",
+            "scaled.npz was trained with observations that this robot does not have: the "
+            "policy's meta.observation.scale is 2.0, ",
         ),
         (
             ["policy=policy.npz", "suite=stage"],
-            "suite is 'stage': give stages, the nearest, or one of ",
+            "suite is 'stage': give stages (the most similar name) or one of ",
         ),
-        (["policy=policy.npz", "suite=no.yaml"], "suite is 'no.yaml', and there is no such file."),
+        (
+            ["policy=policy.npz", "suite=no.yaml"],
+            "suite is 'no.yaml', but this file does not exist: check the path.",
+        ),
         (["policy=policy.npz", "suite=no.npz"], "suite no.npz cannot be read: "),
         (
             ["policy=policy.npz", "suite=stages", "robot.hull_radius=0.04"],
-            "robot.hull_radius is 0.04, but suites are drawn for 0.037: give at most that.",
+            "robot.hull_radius is 0.04, but the levels of suites are made for hulls of at most "
+            "0.037 m: give at most 0.037.",
         ),
         (
             ["policy=policy.npz", "suite=stages", "task.target_radius=0.06"],
-            "task.target_radius is 0.06, but suites are drawn for 0.05: give that.",
+            "task.target_radius is 0.06, but the levels of suites are made for 0.05 m: give 0.05.",
         ),
     ],
 )
@@ -458,5 +465,5 @@ def test_a_comparison_takes_as_many_policies_of_either_recipe(
     monkeypatch.chdir(tmp_path)
     assert _command(monkeypatch, "compare=policy.npz,*e*.npz", "stage=s1", "episodes=1") == 2
     printed = capsys.readouterr().err
-    assert "compare is 'policy.npz,*e*.npz', with 1 and 3 policies: give the same " in printed
+    assert "compare is 'policy.npz,*e*.npz', which names 1 and 3 policies: give as many " in printed
     assert printed.count("\n") == 1

@@ -51,13 +51,17 @@ MISTAKES = [
     (
         "    measures =",
         "    others =",
-        "measures nothing: give it measures = {name: Measure(label, unit)}.",
+        "has no measures: add measures = {name: Measure(label, unit)} to the class.",
     ),
-    ("    measures =", "    ends = 'al'\n    measures =", "has ends 'al': give each, all, never."),
+    (
+        "    measures =",
+        "    ends = 'al'\n    measures =",
+        "has ends 'al': give one of each, all, never.",
+    ),
     (
         "    measures =",
         "    drives = None\n    measures =",
-        "defines drives, which both engines share: rename it.",
+        "defines drives, which goals must not change: rename it.",
     ),
     (
         "return Turn(",
@@ -67,7 +71,7 @@ MISTAKES = [
     (
         "measured={",
         "measured={'far': nearest.max(), ",
-        "measures far, nearest_m: return a Turn whose measured has nearest_m.",
+        "returns a Turn that measures far, nearest_m: return a Turn that measures nearest_m.",
     ),
     (
         "nearest > 0.3",
@@ -77,8 +81,8 @@ MISTAKES = [
     (
         "return Turn(state,",
         "return Turn(nearest,",
-        "returns another state from advance than from begin: return arrays of the same shapes and "
-        "types, here ().",
+        "returns a state from advance that differs from that of begin: return arrays of the same "
+        "shapes and types, here ().",
     ),
 ]
 

@@ -279,7 +279,7 @@ def test_interval_moves_and_stretches_with_the_values(values: np.ndarray) -> Non
 @pytest.mark.parametrize(
     ("shape", "options", "expected"),
     [
-        ((5,), {}, "values has shape (5,): give [runs, tasks]"),
+        ((5,), {}, "values has shape (5,): give an array of shape [runs, tasks]"),
         ((0, 3), {}, "values is empty"),
         ((2, 9), {}, "values has 2 runs: an interval over runs needs 3 or more"),
         ((9, 2), {"draw": "tasks"}, "values has 2 tasks"),

@@ -96,7 +96,7 @@ def test_the_stage_of_training_may_be_changed(odd: str) -> None:
 
 def test_a_limit_that_only_training_reads_is_refused(odd: str) -> None:
     assert refusal(trained_settings.load, EvaluateConfig, [odd, "task.step_limit=500"]) == (
-        "task.step_limit ends only episodes of training: give steps=NUMBER."
+        "task.step_limit works only in training: give steps=NUMBER instead."
     )
 
 
@@ -136,9 +136,8 @@ def test_policies_that_were_trained_differently_need_a_word(tmp_path: Path) -> N
     first, other = (_policy(tmp_path / f"{x}.npz", *ODD[: 1 + x]) for x in (0, 1))
     both = f"{first},{other.partition('=')[2]}"
     assert refusal(_load, both) == (
-        f"{tmp_path / '0.npz'} and {tmp_path / '1.npz'} were trained with different "
-        "values of robot.hull_radius: choose the one to judge them with, as in "
-        "robot.hull_radius=0.044."
+        f"{tmp_path / '0.npz'} and {tmp_path / '1.npz'} were trained with different values of "
+        "robot.hull_radius: give one value for all policies, as in robot.hull_radius=0.044."
     )
     assert _load(both, "robot.hull_radius=0.037").robot.hull_radius == 0.037
 
@@ -147,8 +146,8 @@ def test_a_file_of_an_older_version_says_what_reads_it() -> None:
     meta = policies.meta()
     meta["realism"]["dropout"] = 0.1
     assert refusal(trained_settings.trained, meta, "p.npz") == (
-        "p.npz: meta.realism.dropout is not a key: if an older version wrote it, only "
-        "that version reads it."
+        "p.npz: meta.realism.dropout is not a key of this version: if an older version wrote it, "
+        "use that version."
     )
 
 

@@ -143,15 +143,15 @@ def test_export_refuses(
     (tmp_path / "file").write_text("mine")
     given = f"policy={path}"
     for words, sentence in {
-        (): "run is null and policy is null: give one of them, as in run=runs/a or",
-        (given, "out=copy.npy"): "out is copy.npy, but format is npz: end it in .npz.",
-        (given, "format=onnx", "out=a"): "out is a, but format is onnx: end it in .onnx.",
+        (): "run is null and policy is null: give exactly one of the two, as in run=runs/a or",
+        (given, "out=copy.npy"): "out is copy.npy, but format is npz: end out with .npz.",
+        (given, "format=onnx", "out=a"): "out is a, but format is onnx: end out with .onnx.",
         (given, "format=c", f"out={tmp_path / 'file'}"): "which cannot be written: ",
         (given, "format=c", f"out={tmp_path / 'file' / 'c'}"): "which cannot be written: Not a d",
         (given, f"out={tmp_path / 'file' / 'a.npz'}"): "which cannot be written: ",
         (given, "format=c", "out=."): "out is ., which does not end with a name: add the name of ",
         (given, "format=webots", "out=a/.."): "out is a/.., which does not end with a name: add ",
-        ("policy=none.npz", "format=c"): "none.npz is no file: give the path of a policy.npz.",
+        ("policy=none.npz", "format=c"): "none.npz is not a file: give the path of a policy.npz.",
     }.items():
         assert sentence in _refusal(monkeypatch, capsys, *words)
     assert {found.name for found in tmp_path.iterdir()} == {"policy.npz", "file"}

@@ -227,7 +227,7 @@ def test_slurm_is_asked_for_devices_and_time_to_save(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["grid.arenas=4,8"], "dir is missing and has no default: give it."),
+        (["grid.arenas=4,8"], "dir is missing and has no default: give it a value."),
         (["dir=", "grid.arenas=4,8"], "dir is '': give text."),
         (["dir=x", "cluster=lokal"], "cluster is 'lokal': give slurm, local or debug."),
         (["dir=x", "tries=0"], "tries is 0: give 1 to 1000."),

@@ -110,11 +110,11 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
     ("words", "sentence"),
     [
         (["algo.advantage=monte_carlo", "algo.gae_lambda=0.9"],
-         "algo.gae_lambda is 0.9, but advantage is monte_carlo: gae_lambda is an option of gae, so "
-         "give 0.95 or advantage=gae."),
+         "algo.gae_lambda is 0.9, but advantage is monte_carlo and does not use gae_lambda: "
+         "leave gae_lambda at 0.95, or give advantage=gae."),
         (["algo.std_floor=0.2"],
-         "algo.std_floor is 0.2, but exploration is learned: std_floor is an option of scheduled, "
-         "so give 0.1 or exploration=scheduled."),
+         "algo.std_floor is 0.2, but exploration is learned and does not use std_floor: leave "
+         "std_floor at 0.1, or give exploration=scheduled."),
         (["algo=paper", "algo.std_floor=0.7"],
          "algo.std_floor is 0.7, but initial_std is 0.6: give at most 0.6."),
         (["algo.mean_activation=tanh", "algo.activation=relu"],
@@ -123,7 +123,7 @@ def test_the_clamp_of_each_wheel_takes_the_turn_of_a_fast_command() -> None:
         (["algo=paper", "budget=5999"],
          "budget is 5999, but one update takes arenas x algo.rollout_length = 6000 control steps: "
          "give at least 6000."),
-        (["algo.name=paper"], "algo.name cannot be given: choose a file, as in algo=ppo."),
+        (["algo.name=paper"], "algo.name cannot be set by itself: choose a file, as in algo=ppo."),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(words: list[str], sentence: str) -> None:

@@ -199,11 +199,9 @@ def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
 
 def test_what_a_suite_has_not_is_refused(steer, suite):
     words = [f"policy={steer}", f"suite={suite}"]
-    assert refusal(replay.main, [*words, "worst=6"]) == (
-        "worst is 6: give 1 to 5, the levels there are."
-    )
+    assert refusal(replay.main, [*words, "worst=6"]) == ("worst is 6 of 5 levels: give 1 to 5.")
     assert refusal(load_levels, ReplayConfig, [*words, "level=4"]).endswith(
-        ": say which levels, as in worst=5."
+        ": give worst too, as in worst=5."
     )
     assert refusal(load_levels, ReplayConfig, [*words, "worst=1", "seed=3"]).startswith(
         "seed cannot be given with"
@@ -224,7 +222,7 @@ def test_defaults():
     [
         (["level=x"], "level is 'x': give whole numbers with commas between them, as in 0,7,12."),
         (["level=-1"], "level is '-1': give whole numbers with commas between them, as in 0,7,12."),
-        (["level=1", "worst=2"], "level is 1, but worst is 2: give one of the two."),
+        (["level=1", "worst=2"], "level is 1 and worst is 2: give only one of the two."),
         (["worst=0"], "worst is 0: give 1 to 100."),
         (
             ["stage=curriculum"],

@@ -78,7 +78,7 @@ def test_without_opengl_or_ffmpeg_it_says_what_to_install(monkeypatch):
         raise RuntimeError
 
     monkeypatch.setattr(mujoco, "Renderer", fail)
-    with pytest.raises(ConfigError, match=r"^video cannot be made here .* set MUJOCO_GL=egl "):
+    with pytest.raises(ConfigError, match=r"^video cannot be made here .* set MUJOCO_GL to egl "):
         video.check()
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ConfigError, match=r"^video cannot be made here .* uv sync --extra video"):

@@ -66,7 +66,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        (["run=gone"], "gone is no run directory: it has no config.json."),
+        (["run=gone"], "gone is not a run directory: it has no config.json."),
         (["run=cut"], "cut/metrics.jsonl in line 1 is damaged: resume the run, or remove"),
         (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
         (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),

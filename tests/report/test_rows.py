@@ -84,7 +84,7 @@ def test_seeds_without_a_value_are_left_out_and_counted() -> None:
 @pytest.mark.parametrize(
     ("file", "what"),
     [
-        ("config.json", "{run} is no run directory: it has no config.json."),
+        ("config.json", "{run} is not a run directory: it has no config.json."),
         ("metrics.jsonl", "{run} has no metrics.jsonl: it holds no training yet."),
         ("curriculum.jsonl", "{run} has no curriculum.jsonl: it holds no training yet."),
     ],

@@ -55,7 +55,7 @@ def test_a_directory_of_another_config_is_refused(tmp_path: Path) -> None:
     other = to_dict(replace(made, seeds=5))
     (run / "config.json").write_text(json.dumps(other))
     sentence = refusal(reproduce_arms.settings, ReproduceConfig(), "baseline", tmp_path)
-    assert f"{run} holds a run with other settings: seeds is 10 and not 5." in sentence
+    assert f"{run} holds a run with other settings: seeds is 10, not 5;" in sentence
 
 
 def test_an_arm_that_was_stopped_goes_on(tmp_path: Path) -> None:

@@ -47,7 +47,8 @@ def test_what_was_stopped_goes_on_and_is_judged(
     # The time limit ends before the first arm begins.
     assert reproduce.main([*TINY, f"out={out}", "minutes=0.0001"]) == 0
     assert capsys.readouterr().out == (
-        f"stopped with 1 of 1 arms to train, saved; go on with: python -m swarmjax.reproduce "
+        f"stopped and saved, with 1 of 1 arms left to train; continue with: python -m "
+        "swarmjax.reproduce "
         f"resume={out}\n"
     )
     assert not pages
@@ -81,7 +82,7 @@ def test_another_directory_is_not_written_over(tmp_path: Path) -> None:
     (tmp_path / "reproduce.json").write_text("{}")
     assert refusal(reproduce.main, [f"out={tmp_path}"]) == (
         f"out is {tmp_path}, which is not empty: give a new or an empty folder, or "
-        f"resume={tmp_path} to go on with the reproduction in it."
+        f"resume={tmp_path} to continue the reproduction in it."
     )
 
 
@@ -92,7 +93,7 @@ def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
     stored = {"format": 3, "settings": {"seeds": 3}, "versions": {}}
     (tmp_path / "reproduce.json").write_text(json.dumps(stored))
     assert refusal(reproduce.main, [f"resume={tmp_path}", "budget=1e6"]) == (
-        "budget cannot be given: resume takes minutes alone."
+        "budget cannot be given with resume: leave it out."
     )
 
 
@@ -103,10 +104,10 @@ def test_what_is_no_reproduction_is_not_gone_on_with(tmp_path: Path) -> None:
         (["budget=5999"], "budget is 5999: give 6000 to 2147483647."),
         (["fine_tune=1"], "fine_tune is 1: give 6000 to 2147483647."),
         (["arms=[]"],
-         "arms is []: give some of curriculum, baseline, curriculum_expanded, baseline_expanded, "
-         "modern_curriculum, modern_baseline."),
+         "arms is []: give at least one of curriculum, baseline, curriculum_expanded, "
+         "baseline_expanded, modern_curriculum, modern_baseline."),
         (["arms=[baseline_expanded]"],
-         "arms names baseline_expanded, but not baseline, which it continues."),
+         "arms lists baseline_expanded, which continues baseline: add baseline."),
         (["minutes=0"], "minutes is 0: give more than 0."),
         (["buget=1"], "buget is not a key: did you mean budget?"),
     ],

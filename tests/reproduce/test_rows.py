@@ -119,7 +119,7 @@ REFUSED = {
     ),
     "a seed": (
         lambda out: _drop(out, '"seed": 2'),
-        "no whole episode of seed 2: give a larger budget",
+        "no complete episode of seed 2: give a larger budget",
     ),
     "another seed": (lambda out: _append(out, seed=3), "has seed 3"),
     "lengths": (lambda out: _append(out, sensed=[1]), "has no list of 2 whole numbers as sensed"),
@@ -130,15 +130,15 @@ REFUSED = {
     "stage": (lambda out: _append(out, stage=6), "as stage"),
     "no evaluation": (
         lambda out: (out / "evaluation.json").unlink(),
-        "evaluation.json has no row of arm curriculum, seed 0 on paper6",
+        "evaluation.json has no row for arm curriculum, seed 0, stage paper6",
     ),
     "rows": (
         lambda out: _change(out, "evaluation.json", rows=[row("baseline", 0, LAST)]),
-        "has no row of arm curriculum, seed 0 on paper6",
+        "has no row for arm curriculum, seed 0, stage paper6",
     ),
     "no rows": (
         lambda out: _change(out, "evaluation.json", rows=None),
-        "has no list of rows: remove it to judge again.",
+        "has no list of rows: delete this file to evaluate again.",
     ),
     "a row": (lambda out: _change(out, "evaluation.json", rows=[[]]), "has no list of rows"),
     "a row's seed": (

@@ -71,11 +71,11 @@ def test_a_damaged_checkpoint_is_passed_over_and_named(tmp_path: Path) -> None:
 
 
 def test_nothing_sound_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="holds no checkpoints"):
+    with pytest.raises(CheckpointError, match="has no checkpoints"):
         checkpoint.find(tmp_path / "nowhere")
     _save(tmp_path, 4)
     _flip_one_bit(checkpoint.path_of(tmp_path, 4))
-    with pytest.raises(CheckpointError, match="no sound checkpoint") as error:
+    with pytest.raises(CheckpointError, match="no usable checkpoint") as error:
         checkpoint.find(tmp_path)
     assert "\n" not in str(error.value)
 
@@ -135,7 +135,7 @@ def test_swapped_checkpoints_are_both_passed_over(tmp_path: Path) -> None:
     aside = second.rename(tmp_path / "aside")
     first.rename(second)
     aside.rename(first)
-    with pytest.raises(CheckpointError, match="no sound checkpoint"):
+    with pytest.raises(CheckpointError, match="no usable checkpoint"):
         checkpoint.find(tmp_path)
 
 

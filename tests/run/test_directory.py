@@ -37,7 +37,9 @@ def test_a_second_process_is_refused_until_the_first_is_dead(tmp_path: Path) -> 
         assert holder.stdout.readline() == "held\n"
         try:
             with (
-                pytest.raises(ConfigError, match=f"which process {holder.pid} is writing: wait"),
+                pytest.raises(
+                    ConfigError, match=f"but process {holder.pid} is writing to it: wait"
+                ),
                 directory.locked(run),
             ):
                 pass
@@ -78,7 +80,7 @@ def test_a_log_is_cut_to_the_bytes_that_are_counted(tmp_path: Path) -> None:
 def test_a_log_that_lacks_rows_is_refused_and_left_as_it_is(tmp_path: Path, content: str) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_text(content)
-    with pytest.raises(CheckpointError, match=r"put the file back, or delete it to go on"):
+    with pytest.raises(CheckpointError, match=r"restore the file, or delete it to continue"):
         directory.cut(path, len('{"update": 0}\n{"update": 1}\n'))
     assert path.read_text() == content
 
@@ -92,7 +94,9 @@ def test_a_log_that_was_deleted_is_begun_anew(tmp_path: Path) -> None:
 def test_a_damaged_line_is_named(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b'{"update": 0}\n' + line + b"\n")
-    with pytest.raises(CheckpointError, match=r"metrics.jsonl is damaged at line 2: put the file"):
+    with pytest.raises(
+        CheckpointError, match=r"metrics.jsonl is damaged at line 2: restore the file"
+    ):
         directory.read_rows(path, None)
 
 

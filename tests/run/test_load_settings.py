@@ -32,8 +32,8 @@ def test_a_run_of_an_older_version_says_what_reads_it():
     stored = to_dict(load_train([]))
     stored["task"]["reward"]["time"] = -0.01
     assert refusal(load_resume, stored, []) == (
-        "stored task.reward.time is not a key: if an older version wrote it, only that "
-        "version reads it."
+        "stored task.reward.time is not a key of this version: if an older version wrote it, use "
+        "that version."
     )
 
 
@@ -45,8 +45,8 @@ def test_a_long_word_is_shortened_where_resume_refuses_it():
 def test_resume_refuses_other_keys(word):
     stored = to_dict(load_train([]))
     assert refusal(load_resume, stored, [word]) == (
-        f"{word} cannot be given: resume keeps the rest of the stored run and takes budget, "
-        "devices, resume, run.*, streams, extensions only."
+        f"{word} cannot be given: a resumed run keeps its settings, and only budget, "
+        "devices, resume, run.*, streams, extensions may change."
     )
 
 

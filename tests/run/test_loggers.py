@@ -196,7 +196,7 @@ def _histories(file: Path) -> Iterator[dict]:
 
 def test_a_logger_that_raises_loses_itself_and_not_the_run(told: Told) -> None:
     assert [what for what, _, _ in told.broken.told] == ["write", "write", "close"]
-    assert told.said == "swarmjax: Broken is not written from here on: SystemExit: enough.\n"
+    assert told.said == "swarmjax: Broken gets no more data: SystemExit: enough.\n"
 
 
 @pytest.mark.slow
@@ -218,7 +218,7 @@ def test_a_logger_that_does_not_end_is_left_behind(
     guarded.write([{"update": 0}], {})
     guarded.close()
     for_ever.set()
-    assert "Listening is not written from here on: it has not finished" in capsys.readouterr().err
+    assert "Listening gets no more data: it has not finished" in capsys.readouterr().err
 
 
 def test_numbers_of_a_stage_have_its_name() -> None:

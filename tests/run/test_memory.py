@@ -45,7 +45,7 @@ def test_a_run_too_large_is_refused_with_what_fits(
     with pytest.raises(ConfigError) as caught:
         memory.check(settings, 4 * GIB)
     assert str(caught.value) == (
-        f"arenas is {arenas} and seeds is 1, which needs 4 GiB of memory, and there is 3 GiB: give "
+        f"arenas is {arenas} and seeds is 1, which needs 4 GiB of memory, but 3 GiB is there: give "
         f"at most about {fits} arenas, or fewer seeds."
     )
 

@@ -50,7 +50,8 @@ def test_a_run_holds_the_settings_and_not_the_recipe() -> None:
 def test_an_unknown_recipe_is_refused() -> None:
     known = ", ".join(files.choices("recipes"))
     assert refusal(load_train, ["recipe=world"]) == (
-        f"recipe is 'world': give worlds, the nearest, or one of {known}, or a file .yaml."
+        f"recipe is 'world': give worlds (the most similar name) or one of {known}, or the path of "
+        "a .yaml file."
     )
 
 
@@ -75,14 +76,17 @@ def test_a_recipe_that_extends_itself_is_refused(own: Path, base: str) -> None:
     own.with_name("other.yaml").write_text("recipe: mine.yaml\n")
     said = refusal(load_train, [f"recipe={own}"])
     assert said.startswith(f"{own.parent}/")
-    assert said.endswith(" extends itself: remove the key recipe from one of the files.")
+    assert said.endswith(" extends itself: remove the key `recipe` from one file.")
 
 
 @pytest.mark.parametrize(
     ("base", "expected"),
     [
-        ("world", "recipe is 'world': give worlds, the nearest, or one of w"),
-        ("[worlds]", "{own}: recipe is ['worlds']: give the name of a recipe, or a file .yaml."),
+        ("world", "recipe is 'world': give worlds (the most similar name) or one of w"),
+        (
+            "[worlds]",
+            "{own}: recipe is ['worlds']: give the name of a recipe, or the path of a .yaml file.",
+        ),
     ],
 )
 def test_a_wrong_base_names_the_file(own: Path, base: str, expected: str) -> None:
@@ -95,7 +99,7 @@ def test_a_base_that_cannot_be_found_is_refused(own: Path, base: str) -> None:
     own.with_name("link.yaml").symlink_to("link.yaml")
     own.write_text(f"recipe: {base}\n")
     assert refusal(load_train, [f"recipe={own}"]) == (
-        f"recipe is '{own.with_name(base)}', and there is no such file."
+        f"recipe is '{own.with_name(base)}', but this file does not exist: check the path."
     )
 
 
@@ -119,4 +123,4 @@ def test_an_unknown_key_names_the_file(own: Path) -> None:
 def test_a_resumed_run_keeps_its_settings(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text("{}")
     said = refusal(load_run, ["recipe=worlds", f"resume={tmp_path}"])
-    assert said.startswith("recipe=worlds cannot be given: resume keeps the rest")
+    assert said.startswith("recipe=worlds cannot be given: a resumed run keeps")

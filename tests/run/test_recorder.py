@@ -115,7 +115,7 @@ def test_a_run_goes_on_where_tensorboard_cannot_be_written(
             record.write([_row(update)], [], {"speed": 2.0})
     assert len((tmp_path / "metrics.jsonl").read_text().splitlines()) == 2
     said = capsys.readouterr().err
-    assert said.count("TensorBoard is not written from here on") == 1
+    assert said.count("TensorBoard gets no more data") == 1
 
 
 def test_several_seeds_have_a_folder_each_and_cost_what_one_does(tmp_path: Path) -> None:

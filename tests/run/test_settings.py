@@ -158,42 +158,45 @@ def test_import_needs_neither_jax_nor_hydra():
         (["arenas=1,2"], "arenas is '1,2': give a whole number."),
         (["budget=1M"], "budget is '1M': give a whole number, as in 1e6."),
         (["arenas=${nope}"], "arenas is '${nope}': give a whole number."),
-        (["arenas=!!set {1}"], "arenas is '!!set {1}', which cannot be read: it has the tag "
-         "'tag:yaml.org,2002:set': remove it."),
+        (["arenas=!!set {1}"], "arenas is '!!set {1}', which cannot be read: remove the YAML tag "
+         "'tag:yaml.org,2002:set'."),
         # Groups.
-        (["stage=s7"], f"stage is 's7': give s6, the nearest, or one of {CHOICES}, or a "
-         "file .yaml."),
+        (["stage=s7"], f"stage is 's7': give s6 (the most similar name) or one of {CHOICES}, "
+         "or the path of a .yaml file."),
         (["stage=[s1,s2]"], "stage is '[s1,s2]': give stage=curriculum "
-         f"'stage.sequence=[s1,s2]' for several, or one of {CHOICES}, or a file .yaml."),
-        (["lr=1e-3"], "lr is not a key: did you mean algo.actor_learning_rate or "
-         "algo.critic_learning_rate?"),
-        (["stage=expand"], "stage is 'expand': give expanded, the nearest, or one of "
-         f"{CHOICES}, or a file .yaml."),
-        (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or a file .yaml."),
-        (["stage=null"], f"stage is 'null': give one of {CHOICES}, or a file .yaml."),
+         f"'stage.sequence=[s1,s2]' for several stages, or one of {CHOICES}, or the path of a "
+         ".yaml file."),
+        (["lr=1e-3"], "lr is not a key: did you mean algo.critic_learning_rate or "
+         "algo.actor_learning_rate?"),
+        (["stage=expand"], "stage is 'expand': give expanded (the most similar name) or one of "
+         f"{CHOICES}, or the path of a .yaml file."),
+        (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or the path of a .yaml "
+         "file."),
+        (["stage=null"], f"stage is 'null': give one of {CHOICES}, or the path of a .yaml file."),
         (["robot=legged"], "robot is 'legged': give one of khepera4, paper, planar, planar_v2, "
-         "thymio2, wheeled, wheeled_v2, or a file .yaml."),
+         "thymio2, wheeled, wheeled_v2, or the path of a .yaml file."),
         # Stages and curricula.
         (["stage.side=0.9"], "stage.side cannot be given for curriculum, a curriculum: choose "
          "one stage, as in stage=s6 (in a recipe: 'stage: s6', and 'stage.side: 0.9' below it)."),
-        (["stage.sequence=[s1,s9]"], "stage.sequence is 's9': give s6, the nearest, or one of "
-         f"{CHOICES}, or a file .yaml."),
+        (["stage.sequence=[s1,s9]"], "stage.sequence is 's9': give s6 (the most similar name) or "
+         "one of "
+         f"{CHOICES}, or the path of a .yaml file."),
         (["stage.sequence=[]"], "stage.sequence is []: give at least one stage."),
         (["stage.sequence=s1"], "stage.sequence is 's1': give a list, as in [s1,s2]."),
-        (["stage.sequence=[s1,s1]"], "stage names s1 more than once: give each stage once."),
-        (["stage.sequence=[curriculum]"], "stage.sequence is curriculum, which names several "
-         "stages: give single stages."),
+        (["stage.sequence=[s1,s1]"], "stage lists s1 more than once: give each stage once."),
+        (["stage.sequence=[curriculum]"], "stage.sequence is curriculum, a curriculum of "
+         "several stages: list single stages."),
         (["stage.sequence=[{robots: 2, side: 1}]"], "stage.name is missing and has "
-         "no default: give it."),
+         "no default: give it a value."),
         (["stage=s3", "stage.sequence=[s1]"], "stage.sequence is not a key: give one of name, "
          "robots, side, distance, obstacles, obstacle_size, level, layout, map, cell, breadth, "
          "gap, width, depth, length, radius, apart, cells."),
-        (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give the file's name."),
+        (["stage=s3", "stage.name=s4"], "stage.name is 's4' in s3.yaml: give 's3'."),
         (["stage=s3", "stage.layout=fence"], "stage.layout is fence, but level is random: give "
          "level=fixed."),
         # Types and bounds.
         (["task.arrival=stay"], "task.arrival is 'stay': give latch or hold."),
-        (["task=3"], "task is 3: give its keys, such as task.control_step."),
+        (["task=3"], "task is 3: give one of its keys, such as task.control_step."),
         (["algo.hidden_sizes=64"], "algo.hidden_sizes is 64: give a list, as in [64,64]."),
         (["algo.hidden_sizes=[]"], "algo.hidden_sizes is []: give at least one layer, as in "
         "[64,64]."),
@@ -207,8 +210,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["seed=-1"], "seed is -1: give 0 to 2147483647."),
         (["robot.max_speed=0"], "robot.max_speed is 0: give 0.001 to 5."),
         (["robot.max_speed=0.3"], "robot.max_speed is 0.3, but wheels of 0.02 m at 6.28 rad/s "
-         "reach 0.1256 m/s: give at most that, or wheel_limit=clip, with which the robot drives "
-         "no faster."),
+         "reach only 0.1256 m/s: give at most 0.1256, or wheel_limit=clip, which limits the "
+         "speed to that."),
         (["robot.hull_radius=-0.08"], "robot.hull_radius is -0.08: give more than 0, at most "
          "0.15."),
         (["curriculum.budget_share=1"], "curriculum.budget_share is 1: give more than 0, less "
@@ -228,7 +231,8 @@ def test_import_needs_neither_jax_nor_hydra():
          "curriculum.threshold is [0.9,0.8], but curriculum.axes makes 2 stages: give one "
          "number."),
         (["curriculum.mode=greedy"], "curriculum.mode is 'greedy': give one of sequential, "
-         "mixed, adaptive, frontier, or extensions=FILE, a file that defines it."),
+         "mixed, adaptive, frontier, or add extensions=FILE, the Python file that defines this "
+         "curriculum."),
         (["curriculum.mode=adaptive", "curriculum.floor=0"], "curriculum.floor is 0: give more "
          "than 0, at most 1."),
         (["stage=s6", "stage.side=5"], "stage.side is 5, but level is random: give at "
@@ -244,25 +248,26 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=s6", "stage.side=[0.7,1.2]"], "stage.side is [0.7,1.2], too small for robots=5, "
          "obstacles=3, obstacle_size=0.1: give at least 0.77."),
         # Options of a mode.
-        (["curriculum.score=failure"], "curriculum.score is failure, but mode is mixed: score is "
-         "an option of adaptive, so give learnability or mode=adaptive."),
+        (["curriculum.score=failure"], "curriculum.score is failure, but mode is mixed and does "
+         "not "
+         "use score: leave score at learnability, or give mode=adaptive."),
         (["curriculum.mode=mixed", "curriculum.floor=0.2"], "curriculum.floor is 0.2, but mode is "
-         "mixed: floor is an option of adaptive and frontier, so give 0.1 or mode=adaptive."),
+         "mixed and does not use floor: leave floor at 0.1, or give mode=adaptive or frontier."),
         (["curriculum.mode=adaptive", "curriculum.optimizer=reset"], "curriculum.optimizer is "
-         "reset, but mode is adaptive: optimizer is an option of sequential and mixed, so give "
-         "keep or mode=sequential."),
-        (["stage.sequence=[s1,worlds]"], "stage.sequence is worlds, which names several stages: "
-         "give single stages."),
+         "reset, but mode is adaptive and does not use optimizer: leave optimizer at keep, or give "
+         "mode=sequential or mixed."),
+        (["stage.sequence=[s1,worlds]"], "stage.sequence is worlds, a curriculum of several "
+         "stages: list single stages."),
         # Checks across keys.
-        (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels lie "
-         "inside the hull: give less than 0.074."),
+        (["robot.track=0.08"], "robot.track is 0.08, but hull_radius is 0.037 and the wheels "
+         "must lie inside the hull: give less than 0.074."),
         (["stage=s6", "stage.robots=6", "sim.max_robots=5"], "stage.robots is 6, but "
          "sim.max_robots is 5: give 1 to 5."),
         (["sim.max_obstacles=2"], "stage s6: obstacles is 3, but sim.max_obstacles is 2: give 0 "
          "to 2."),
         (["seeds=0"], "seeds is 0: give 1 to 4096."),
         (["seed=2147483647", "seeds=2"], "seed is 2147483647, but seeds is 2 and the last seed "
-         "may be at most 2147483647: give at most 2147483646."),
+         "may be at most 2147483647: give a seed of at most 2147483646."),
         (["seeds_by=pmap"], "seeds_by is 'pmap': give vmap, cores or devices."),
         (["arenas=100"], "arenas is 100, but algo.num_minibatches is 8: give a multiple of 8."),
         (["budget=4095"], "budget is 4095, but one update takes arenas x algo.rollout_length = "
@@ -282,10 +287,10 @@ def test_train_refuses(words, sentence):
          "levels: leave stage or suite out."),
         (["suite=all", "seed=2"], "seed cannot be given with suite=all, which sets its own "
          "levels: leave seed or suite out."),
-        (["compare=a,b"], "policy is 'p' and compare is 'a,b': give one of them, policy=FILE or "
-         "compare=FILE,FILE."),
-        (["policy=null"], "policy is null and compare is null: give one of them, policy=FILE or "
-         "compare=FILE,FILE."),
+        (["compare=a,b"], "policy is 'p' and compare is 'a,b': give exactly one of the two, "
+         "policy=FILE or compare=FILE,FILE."),
+        (["policy=null"], "policy is null and compare is null: give exactly one of the two, "
+         "policy=FILE or compare=FILE,FILE."),
         (["workers=0"], "workers is 0: give 1 to 1024."),
         (["engine=warp"], "engine is 'warp': give c or mjx."),
         (["algo=ppo"], "algo is not a key: give one of stage, robot, task, suite, realism, action, "
@@ -306,14 +311,12 @@ def test_export_refuses_an_unknown_format():
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "run is null and policy is null: give one of them, as in run=runs/a or "
+        ([], "run is null and policy is null: give exactly one of the two, as in run=runs/a or "
          "policy=policy.npz."),
-        (["run=r", "policy=p"], "run is 'r' and policy is 'p': give one of them, as in run=runs/a "
-         "or policy=policy.npz."),
-        (["policy=p", "format=c", "seed=1"], "seed is 1, but policy is one file: give seed with "
-         "run."),
-        (["policy=p", "format=c", "step=1"], "step is 1, but policy is one file: give step with "
-         "run."),
+        (["run=r", "policy=p"], "run is 'r' and policy is 'p': give exactly one of the two, as "
+         "in run=runs/a or policy=policy.npz."),
+        (["policy=p", "format=c", "seed=1"], "seed is 1, but works only with run: leave seed out."),
+        (["policy=p", "format=c", "step=1"], "step is 1, but works only with run: leave step out."),
         (["policy=p"], "out is null, but policy is already an npz file: give out=FILE."),
     ],
 )  # fmt: skip
@@ -332,8 +335,8 @@ def test_a_budget_of_most_gradient_steps_is_enough():
 
 def test_a_budget_of_more_gradient_steps_than_32_bits_is_refused():
     sentence = (
-        "budget is 1099511627776, but gradient steps are counted in 32 bits: give at most "
-        "1099511623680, more arenas, or a longer algo.rollout_length."
+        "budget is 1099511627776, but gradient steps are counted in 32 bits: give a budget of at "
+        "most 1099511623680, more arenas, or a longer algo.rollout_length."
     )
     assert refusal(load_train, ["budget=1099511627776"]) == sentence
 
@@ -459,4 +462,4 @@ def test_a_file_of_a_curriculum_may_have_its_name(tmp_path: Path) -> None:
     assert (config.stage_name, config.stage_names) == ("mine", ["s1", "s2"])
     (tmp_path / "mine.yaml").write_text("name: yours\nsequence: [s1, s2]\n")
     said = refusal(load_train, [f"stage={tmp_path}/mine.yaml"])
-    assert said == "stage.name is 'yours' in mine.yaml: give the file's name."
+    assert said == "stage.name is 'yours' in mine.yaml: give 'mine'."

@@ -55,8 +55,10 @@ def test_a_recipe_sets_what_is_trained_and_nothing_else(
     path = tmp_path / "mine.yaml"
     path.write_text(f"{KINDS[kind][1]}{key}: {value.replace('evil.py', str(evil))}\n")
     said = refusal(KINDS[kind][0], path)
-    assert said.startswith(f"{path}: {key} cannot be set by a file, which may set stage, robot, ")
-    assert said.endswith(f": remove it, and give {key} on the command line.")
+    assert said.startswith(
+        f"{path}: {key} cannot be set in a file, which may set only stage, robot, "
+    )
+    assert said.endswith(f": give {key} on the command line.")
     assert not (tmp_path / "ran").exists()
 
 
@@ -72,7 +74,7 @@ def test_a_sound_file_of_each_kind_is_read(tmp_path: Path, kind: str) -> None:
 def test_a_tag_is_one_sentence(tmp_path: Path, kind: str, tag: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(f"{KINDS[kind][1]}name: {tag}\n")
-    assert refusal(KINDS[kind][0], path).startswith(f"{path} cannot be read: it has the tag '")
+    assert refusal(KINDS[kind][0], path).startswith(f"{path} cannot be read: remove the YAML tag '")
 
 
 @pytest.mark.parametrize(
@@ -122,7 +124,7 @@ def test_a_recipe_beside_resume_is_refused(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps(to_dict(load_train([]))))
     (tmp_path / "mine.yaml").write_text("algo: {discount: 0.5}\n")
     said = refusal(load_run, [f"recipe={tmp_path / 'mine.yaml'}", f"resume={tmp_path}"])
-    assert "cannot be given: resume keeps the rest of the stored run" in said
+    assert "cannot be given: a resumed run keeps its settings" in said
 
 
 # Runs and policies
@@ -146,7 +148,7 @@ def test_a_run_with_an_extension_asks_for_it(tmp_path: Path) -> None:
     digest = trained.pieces["reward"]["brave"]
     assert refusal(load_resume, stored, []) == (
         f"the stored run was trained with the reward brave of digest {digest[:12]}, but extensions "
-        "holds no such piece: give extensions=FILE, the file of its training."
+        "has no such piece: give extensions=FILE, the file of that training."
     )
     assert settle(load_resume(stored, [f"extensions={path}"])).extensions == str(path)
 

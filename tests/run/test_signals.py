@@ -54,7 +54,7 @@ def test_a_signal_asks_to_stop_and_says_so(number: int, code: int) -> None:
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
     assert process.returncode == code
-    assert said == "stopping after the current call, to save; a second signal stops at once\n"
+    assert said == "saving and stopping after the current updates; a second signal stops at once\n"
 
 
 @pytest.mark.parametrize("ignored", [signal.SIGHUP, signal.SIGINT])
@@ -66,7 +66,7 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(ignored: int) -> No
     process.send_signal(signal.SIGUSR1)  # the first signal that counts
     _, said = process.communicate(timeout=30)
     assert process.returncode == REQUEUE
-    assert said.count("stopping after the current call") == 1
+    assert said.count("saving and stopping after the current updates") == 1
     assert "stopped at once" not in said
 
 

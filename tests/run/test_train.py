@@ -391,7 +391,7 @@ def test_foreign_and_missing_runs_are_refused(
     stored = to_dict(load_train(TINY))
     (tmp_path / "config.json").write_text(json.dumps(stored))
     (tmp_path / "checkpoints" / "4").mkdir(parents=True)
-    assert "no sound checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
+    assert "no usable checkpoint" in _refusal(capsys, "train", f"resume={tmp_path}")
 
 
 @pytest.mark.slow

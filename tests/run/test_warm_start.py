@@ -191,8 +191,8 @@ def test_any_other_number_of_seeds_is_refused(
 ) -> None:
     sentence = _refusal(capsys, monkeypatch, *TINY, f"init_from={pair}", f"seeds={count}")
     assert sentence == (
-        f"init_from is '{pair}', a run of 2 seeds, but seeds is {count}: give seeds=2, or a run "
-        "of one seed."
+        f"init_from is '{pair}', a run of 2 seeds, but seeds is {count}: give seeds=2, or "
+        "init_from a run of one seed."
     )
 
 
@@ -237,31 +237,37 @@ def test_a_started_run_resumes_without_the_run_it_started_from(
     [
         (
             ["algo.policy=independent"],
-            "algo.policy is shared, but here it is independent: give algo.policy=shared",
+            "a run with algo.policy=shared, but here algo.policy is independent: give "
+            "algo.policy=shared",
         ),
         (
             ["algo.hidden_sizes=[8,8]"],
-            "algo.hidden_sizes is [8], but here it is [8,8]: give algo.hidden_sizes=[8]",
+            "a run with algo.hidden_sizes=[8], but here algo.hidden_sizes is [8,8]: give "
+            "algo.hidden_sizes=[8]",
         ),
         (
             ["algo.memory=gru", "algo.rollout_length=8"],
-            "algo.memory is none, but here it is gru: give algo.memory=none",
+            "a run with algo.memory=none, but here algo.memory is gru: give algo.memory=none",
         ),
         (
             ["algo.critic=state"],
-            "algo.critic is observation, but here it is state: give algo.critic=observation",
+            "a run with algo.critic=observation, but here algo.critic is state: give "
+            "algo.critic=observation",
         ),
         (
             ["algo.activation=relu"],
-            "algo.activation is tanh, but here it is relu: give algo.activation=tanh",
+            "a run with algo.activation=tanh, but here algo.activation is relu: give "
+            "algo.activation=tanh",
         ),
         (
             ["algo.mean_activation=tanh"],
-            "algo.mean_activation is linear, but here it is tanh: give algo.mean_activation=linear",
+            "a run with algo.mean_activation=linear, but here algo.mean_activation is tanh: give "
+            "algo.mean_activation=linear",
         ),
         (
             ["realism=webots"],
-            "task.encoding is metric, but here it is webots: give task.encoding=metric",
+            "a run with task.encoding=metric, but here task.encoding is webots: give "
+            "task.encoding=metric",
         ),
     ],
 )
@@ -285,7 +291,7 @@ def test_a_run_that_remembers_names_the_memory_that_it_has(
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
     said = _refusal(capsys, monkeypatch, *TINY[:4], "arenas=8", "init_from=.", word)
-    assert said.startswith("init_from is '.', whose ")
+    assert said.startswith("init_from is '.', a run with ")
     assert "memory_size is 64, but memory is none" not in said
 
 
@@ -296,8 +302,8 @@ def test_independent_learners_are_told_how_many_they_were(
     (tmp_path / "config.json").write_text(json.dumps(stored))
     monkeypatch.chdir(tmp_path)
     assert _refusal(capsys, monkeypatch, *TINY, "init_from=.", "sim.max_robots=3") == (
-        "init_from is '.', whose sim.max_robots is 2, but here it is 3: give sim.max_robots=2, or "
-        "another run."
+        "init_from is '.', a run with sim.max_robots=2, but here sim.max_robots is 3: give "
+        "sim.max_robots=2, or another run."
     )
 
 
@@ -309,20 +315,22 @@ def test_what_is_no_sound_run_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = [*TINY, "init_from=bad", "run.dir=new"]
-    takes = "init_from is 'bad': it takes the directory of a run with a sound checkpoint, but "
+    takes = (
+        "init_from is 'bad', which must be the directory of a run with a usable checkpoint, but "
+    )
     sentence = _refusal(capsys, monkeypatch, *words)
-    assert sentence == f"{takes}bad is no run directory: it has no config.json."
+    assert sentence == f"{takes}bad is not a run directory: it has no config.json."
 
     shutil.copytree(trained, "bad", ignore=shutil.ignore_patterns("checkpoints"))
     sentence = _refusal(capsys, monkeypatch, *words)
-    assert sentence == f"{takes}bad holds no checkpoints: give a run directory that has some."
+    assert sentence == f"{takes}bad has no checkpoints: give a run directory that has some."
 
     shutil.copytree(trained / "checkpoints", "bad/checkpoints")
     for step in (2, 3):
         _flip_one_bit(Path("bad"), step)
     sentence = _refusal(capsys, monkeypatch, *words)
     assert sentence.startswith(
-        f"{takes}bad has no sound checkpoint: checkpoint 3 of bad cannot be used"
+        f"{takes}bad has no usable checkpoint: checkpoint 3 of bad cannot be used"
     )
     assert not Path("new").exists()
 
@@ -339,7 +347,7 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     (tmp_path / "checkpoints").symlink_to(trained / "checkpoints")
     words = [f"init_from={tmp_path}", "algo.hidden_sizes=[16]", f"run.dir={tmp_path / 'new'}"]
     sentence = _refusal(capsys, monkeypatch, *TINY, *words)
-    assert sentence.startswith(f"init_from is '{tmp_path}': it takes the directory of a run with")
+    assert sentence.startswith(f"init_from is '{tmp_path}', which must be the directory of a run")
     assert sentence.endswith("cannot be used (it was written with another config.json).")
 
 
@@ -348,8 +356,8 @@ def test_a_checkpoint_that_its_config_belies_is_refused(
     [
         (
             ["init_from=a", "resume={}"],
-            "init_from=a cannot be given: resume keeps the rest of the stored run and takes "
-            "budget, devices, resume, run.*, streams, extensions only.",
+            "init_from=a cannot be given: a resumed run keeps its settings, and only budget, "
+            "devices, resume, run.*, streams, extensions may change.",
         ),
         (["init_from="], "init_from is '': give text or null."),
     ],

@@ -25,20 +25,20 @@ ONE = "[[0.03,0,0]]"
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["robot.sensor_poses=[[0.04,0,0]]"], "robot.sensor_poses holds [0.04,0,0] for sensor 0, "
-         "0.040000 m from the middle, but hull_radius is 0.037: move the sensor to at most that, "
-         "rounded towards the middle, or give a larger hull."),
-        (["robot.hull_radius=0.03"], "robot.sensor_poses holds [0.03,-0.01,-0.30081] for sensor "
-         "0, 0.031623 m from the middle, but hull_radius is 0.03: move the sensor to at most that, "
-         "rounded towards the middle, or give a larger hull."),
+        (["robot.sensor_poses=[[0.04,0,0]]"], "robot.sensor_poses puts sensor 0 at [0.04,0,0], "
+         "0.040000 m from the middle, but hull_radius is 0.037: move the sensor to at most "
+         "0.037 m, rounded towards the middle, or give a larger hull."),
+        (["robot.hull_radius=0.03"], "robot.sensor_poses puts sensor 0 at "
+         "[0.03,-0.01,-0.30081], 0.031623 m from the middle, but hull_radius is 0.03: move the "
+         "sensor to at most 0.03 m, rounded towards the middle, or give a larger hull."),
         (["robot.sensor_poses=[[0.03,0,3.14159]]"], "robot.sensor_range is 0.04, but the ray of "
          "sensor 0, [0.03,0,3.14159], runs 0.067 m within its own hull and would see nothing: "
          "give a larger range, or turn or move the sensor outwards."),
         (["robot.sensor_range=0"], "robot.sensor_range is 0: give more than 0, at most 1."),
         (["robot.sensor_height=0.05"], "robot.sensor_height is 0.05: give more than 0.0025, less "
          "than 0.0475."),
-        (["robot.sensor_poses=[[0.03,0,40]]"], "robot.sensor_poses holds [0.03,0,40] for sensor 0, "
-         "but its yaw, the last number, is in radians: give -6.2832 to 6.2832."),
+        (["robot.sensor_poses=[[0.03,0,40]]"], "robot.sensor_poses holds [0.03,0,40] for sensor "
+         "0, whose last number is its yaw in radians: give a yaw of -6.2832 to 6.2832."),
         (["robot.sensor_poses=[]"], "robot.sensor_poses has 0 sensors: give 1 to 32."),
         (["robot.sensor_poses=[[0.03,0]]"], "robot.sensor_poses is [0.03,0]: give 3 numbers."),
         (["robot.sensor_poses=3"], "robot.sensor_poses is 3: give a list, as in "
@@ -46,9 +46,9 @@ ONE = "[[0.03,0,0]]"
         (["robot.sensor_response=[[0,9,0],[0.1,9,0]]"], "robot.sensor_response is "
          "[[0,9,0],[0.1,9,0]]: give two or more rows [distance, value, relative deviation], with "
          "rising distances and falling values."),
-        ([f"robot.sensor_poses={ONE}", "realism=real"], "realism.infrared is real, which repeats "
-         "the measured sensors of the e-puck, but robot.sensor_poses are others: give "
-         "realism.infrared=webots, with robot.sensor_response, or realism.infrared=ideal."),
+        ([f"robot.sensor_poses={ONE}", "realism=real"], "realism.infrared is real, which uses "
+         "the measured sensors of the e-puck, but robot.sensor_poses has other sensors: give "
+         "realism.infrared=webots with robot.sensor_response, or realism.infrared=ideal."),
     ],
 )  # fmt: skip
 def test_impossible_sensors_are_refused(words: list[str], sentence: str) -> None:
@@ -70,7 +70,7 @@ def test_a_policy_is_refused_on_a_robot_with_other_sensors(tmp_path: Path) -> No
     )
     with pytest.raises(PolicyError) as caught:
         judge.check_policy(config, config.stage, "p.npz", trained)
-    assert str(caught.value).startswith("p.npz was trained with other sensors: its meta")
+    assert str(caught.value).startswith("p.npz was trained with other sensors: the policy's meta")
 
 
 def test_the_observation_has_an_entry_for_each_sensor() -> None:

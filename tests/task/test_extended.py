@@ -130,8 +130,8 @@ def test_observations_may_be_left_out() -> None:
         ("@level_drawing\ndef ring(level, key): return level._replace(start=level.start + jnp.nan)",
          "level ring, drawn for stage ring: a number is not finite."),
         ("@level_drawing\ndef ring(level, key): return level._replace(obstacle=2 * level.obstacle)",
-         "level ring changes the half edges of obstacles: leave obstacle[:, 3:] as it is, and give "
-         "the stage's obstacle_size."),
+         "level ring changes the sizes of obstacles: leave obstacle[:, 3:] as it is, and set the "
+         "stage's obstacle_size."),
     ],
 )  # fmt: skip
 def test_a_piece_that_does_not_fit_is_one_sentence(
@@ -151,14 +151,15 @@ def test_what_the_task_names_and_nobody_defines_is_refused() -> None:
     ):
         sentence = refusal(partial(task_world.load, sim=SIM, task=TaskConfig(**task)), stages)
         assert sentence == (
-            f"{key}which is not part of swarmjax: give extensions=FILE, the file that defines it."
+            f"{key}which is not part of swarmjax: add extensions=FILE, the Python file that "
+            "defines 'x'."
         )
 
 
 def test_a_way_of_drawing_that_is_missing_is_refused() -> None:
     assert refusal(partial(task_world.load, sim=SIM), (RING,)) == (
-        f"stage ring: level is 'ring': give one of {', '.join(BUILT_IN)}, or extensions=FILE, a "
-        "file that defines it."
+        f"stage ring: level is 'ring': give one of {', '.join(BUILT_IN)}, or add extensions=FILE, "
+        "the Python file that defines this level."
     )
 
 

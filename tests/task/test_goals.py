@@ -217,8 +217,8 @@ def test_jax_and_numpy_agree_for_one_arena_and_for_many(task: TaskConfig) -> Non
     [
         (
             {"goal": "gather", "arrival": "hold"},
-            "arrival is hold, but goal is gather: arrival is an option of navigate, so give latch "
-            "or goal=navigate.",
+            "arrival is hold, but goal is gather and does not use arrival: leave arrival at latch, "
+            "or give goal=navigate.",
         ),
         (
             {"target_speed": 0.1, "reward": RewardConfig(path_progress=1.0)},
@@ -237,6 +237,6 @@ def test_an_unknown_goal_is_refused() -> None:
     with pytest.raises(ConfigError) as caught:
         _goal(goal="gathr")
     assert str(caught.value) == (
-        "task.goal is 'gathr': give one of navigate, lifelong, gather, cover, or extensions=FILE, "
-        "the file that defines it."
+        "task.goal is 'gathr': give one of navigate, lifelong, gather, cover, or add "
+        "extensions=FILE, the Python file that defines this goal."
     )

@@ -381,17 +381,21 @@ def _change(name: str, **changed: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "changed", "said"),
     [
-        ("trap", {"side": 0.5}, "stage world_trap: level=trap has no room for 1 robots, since "),
+        ("trap", {"side": 0.5}, "stage world_trap: level=trap has no room for 1 robots, because "),
         ("door", {"gap": 0.07}, "gap is 0.07: give 0.08 to 1."),
         ("maze", {"cells": None}, "cells is missing: level=maze needs cells."),
         ("row", {"apart": None}, "apart is missing: level=row needs gap and apart."),
-        ("circle", {"depth": 0.2}, "depth is 0.2, but level is circle, which has none: leave "),
-        ("bay", {"robots": 3}, "robots is 3, but level=bay has room for 2: give at most that."),
-        ("fence", {"side": 0.4}, "stage world_fence: level=fence has no room for 5 robots, since "),
+        ("circle", {"depth": 0.2}, "depth is 0.2, but level is circle, which has no depth: leave "),
+        ("bay", {"robots": 3}, "robots is 3, but level=bay has room for 2: give at most 2."),
+        (
+            "fence",
+            {"side": 0.4},
+            "stage world_fence: level=fence has no room for 5 robots, because ",
+        ),
         (
             "crowd",
             {"side": 0.6},
-            "stage world_crowd: level=crowd has no room for 40 robots, since ",
+            "stage world_crowd: level=crowd has no room for 40 robots, because ",
         ),
         (
             "circle",

@@ -201,11 +201,11 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
          "[low,high] of whole numbers or null."),
         (["realism.mass=[0.2,0.13]"], "realism.mass is [0.2,0.13]: give the lower number first."),
         # Words.
-        (["realism=null"], "realism is 'null': give one of ideal, real, webots, or a "
-         "file .yaml."),
-        (["realism=reel"], "realism is 'reel': give real, the nearest, or one of ideal, real, "
-         "webots, or a file .yaml."),
-        (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
+        (["realism=null"], "realism is 'null': give one of ideal, real, webots, or the path of "
+         "a .yaml file."),
+        (["realism=reel"], "realism is 'reel': give real (the most similar name) or one of "
+         "ideal, real, webots, or the path of a .yaml file."),
+        (["realism.name=real"], "realism.name cannot be set by itself: choose a file, as in "
          "realism=webots."),
         (["realism.infrared=counts"], "realism.infrared is 'counts': give ideal, webots or real."),
         (["realism.speed_quantisation=epuck"], "realism.speed_quantisation is 'epuck': give "
@@ -216,29 +216,33 @@ def test_encoding_follows_the_sensors_unless_given(encoding, infrared, resolved)
         (["dead_sensor=0"], "dead_sensor is not a key: did you mean realism.dead_sensor?"),
         # Sensors that have no counts.
         (["realism.infrared_gain=[0.7,1.3]"], "realism.infrared_gain is [0.7,1.3], but infrared "
-         "is ideal and has no counts: give null, or infrared=webots or infrared=real."),
+         "is ideal and has no sensor counts: give null for infrared_gain, or give "
+         "infrared=webots or real."),
         (["realism=webots", "realism.infrared=ideal"], "realism.infrared_noise is [1,1], but "
-         "infrared is ideal and has no counts: give null, or infrared=webots or infrared=real."),
+         "infrared is ideal and has no sensor counts: give null for infrared_noise, or "
+         "give infrared=webots or real."),
         # Impossible bodies.
         (["robot.mass=-1"], "robot.mass is -1: give more than 0, at most 100."),
-        (["robot.mass=0.01"], "robot.mass is 0.01, but wheel_mass is "
-         "0.005 and the mass includes two wheels: give more than 0.01."),
+        (["robot.mass=0.01"], "robot.mass is 0.01, but wheel_mass is 0.005 and mass includes "
+         "both wheels: give more than 0.01."),
         (["realism.mass=[-0.1,0.2]"], "realism.mass is [-0.1,0.2]: give more than 0.01, at most "
          "100."),
         (["robot.effective_track=0.074"], "robot.effective_track is 0.074, but hull_radius is "
-         "0.037 and the wheels lie inside the hull: give less than 0.074."),
+         "0.037 and the wheels must lie inside the hull: give less than 0.074."),
         (["robot.wheel_radius=0.04"], "robot.wheel_radius is 0.04, but hull_radius is 0.037 and "
-         "the wheels lie inside the hull: give less than 0.037."),
+         "the wheels must lie inside the hull: give less than 0.037."),
         (["realism.track=[0.052,0.08]"], "realism.track is [0.052,0.08], but robot.hull_radius "
-         "is 0.037 and the wheels lie inside the hull: give less than 0.074."),
+         "is 0.037 and the wheels must lie inside the hull: give less than 0.074."),
         (["realism.wheel_radius=[0.02,0.03]"], "realism.wheel_radius is [0.02,0.03]: give "
          "0.001 or more, less than 0.03."),
         (["robot.hull_radius=0.029", "robot.sensor_poses=[[0.02,0,0]]",
-          "realism.wheel_radius=[0.02,0.0295]"], "realism.wheel_radius is [0.02,0.0295], but "
-         "robot.hull_radius is 0.029 and the wheels lie inside the hull: give less than 0.029."),
+          "realism.wheel_radius=[0.02,0.0295]"], (
+              "realism.wheel_radius is [0.02,0.0295], but robot.hull_radius is 0.029 and the "
+              "wheels must lie inside the hull: give less than 0.029."
+          )),
         # The wheels have 2 * (5.1e-7 + 0.005 * 0.026^2) = 2 * (5.1e-7 + 3.38e-6) = 7.78e-6.
         (["robot=wheeled", "robot.yaw_inertia=7e-6"], "robot.yaw_inertia is 7e-06, but body is "
-         "wheeled and its wheels alone have 7.78e-06: give more than 7.78e-06."),
+         "wheeled, and the wheels alone have 7.78e-06: give more than 7.78e-06."),
         (["robot.motor_lag=-0.1"], "robot.motor_lag is -0.1: give 0 to 1."),
         # Impossible draws.
         (["realism.friction=[0,1]"], "realism.friction is [0,1]: give 0.001 to 10."),
@@ -274,8 +278,8 @@ def test_train_refuses(words, sentence):
         (["realism.infrared_period=[1,48]"], "realism.infrared_period is [1,48], but an episode "
          "takes 48 s: give less than 48."),
         (["realism.track=[0.05,0.09]"], "realism.track is [0.05,0.09], but robot.hull_radius is "
-         "0.037 and the wheels lie inside the hull: give less than 0.074."),
-        (["realism.name=real"], "realism.name cannot be given: choose a file, as in "
+         "0.037 and the wheels must lie inside the hull: give less than 0.074."),
+        (["realism.name=real"], "realism.name cannot be set by itself: choose a file, as in "
          "realism=webots."),
     ],
 )  # fmt: skip
@@ -290,7 +294,7 @@ def test_metres_know_neither_noise_nor_gain_nor_reflectance(factor):
     if factor in counted:
         sentence = refusal(build, RealismConfig, realism)
         assert sentence.startswith(f"{factor} is ")
-        assert ", but infrared is ideal and has no counts" in sentence
+        assert ", but infrared is ideal and has no sensor counts" in sentence
     else:
         assert getattr(build(RealismConfig, realism), factor) == REAL[factor]
 

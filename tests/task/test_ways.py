@@ -150,7 +150,10 @@ def test_roots_are_whole_and_exact(square: int) -> None:
     ("distance", "message"),
     [
         (0.06, "a robot arrives within 0.05 m of its target: give at least 0.07"),
-        (3.0, "in 16 levels no robot has a way of this length to its target: give less"),
+        (
+            3.0,
+            "in 16 sampled levels no robot has a path of this length to its target: give a smaller",
+        ),
     ],
 )
 def test_a_distance_that_no_level_has_is_refused(distance: float, message: str) -> None:
@@ -170,7 +173,9 @@ def test_an_arena_without_any_obstacle_has_ways() -> None:
 
 
 def test_a_fixed_level_takes_no_distance() -> None:
-    with pytest.raises(ConfigError, match="level is fixed, whose starts are given: leave distance"):
+    with pytest.raises(
+        ConfigError, match="level is fixed, which sets the starts itself: leave distance"
+    ):
         StageConfig(name="x", robots=2, side=1.2, level="fixed", distance=0.3)
 
 

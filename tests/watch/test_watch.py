@@ -282,7 +282,7 @@ def test_a_folder_that_is_no_run_is_one_sentence(
 ) -> None:
     assert _command(monkeypatch, f"run={tmp_path}") == 2
     said = capsys.readouterr().err
-    assert said.endswith(f"{tmp_path} is no run directory: it has no config.json.\n")
+    assert said.endswith(f"{tmp_path} is not a run directory: it has no config.json.\n")
     assert said.count("\n") == 1
 
 

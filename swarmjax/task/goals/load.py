@@ -42,9 +42,9 @@ def load(task: TaskConfig, robot: RobotConfig, own: Sequence[OwnGoal] = ()) -> G
     if task.goal not in there:
         raise ConfigError(
             f"task.goal is {show(task.goal)}: give one of {', '.join(('navigate', *there))}, or "
-            "extensions=FILE, the file that defines it."
+            "add extensions=FILE, the Python file that defines this goal."
         )
     cls = there[task.goal]
     if not (isinstance(cls, type) and issubclass(cls, Goal)):
-        raise ConfigError(f"goal {task.goal} is no class of swarmjax.task.goals.goal.Goal.")
+        raise ConfigError(f"goal {task.goal} is not a subclass of swarmjax.task.goals.goal.Goal.")
     return cls(sizes)

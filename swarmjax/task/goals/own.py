@@ -63,8 +63,8 @@ def check(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles
         raise ConfigError(f"{name} returns no Turn from advance: return Turn(state, target, ...).")
     if {*found.measured} != {*goal.measures}:
         raise ConfigError(
-            f"{name} measures {', '.join(found.measured) or 'nothing'}: return a Turn whose "
-            f"measured has {', '.join(goal.measures)}."
+            f"{name} returns a Turn that measures {', '.join(found.measured) or 'nothing'}: return "
+            f"a Turn that measures {', '.join(goal.measures)}."
         )
     _check_shapes(name, first, found, robots)
     _check_state(name, state, found.state)
@@ -75,13 +75,13 @@ def _check_class(name: str, goal: Goal) -> None:
     measures = goal.measures
     if not measures or not all(isinstance(each, Measure) for each in measures.values()):
         raise ConfigError(
-            f"{name} measures nothing: give it measures = {{name: Measure(label, unit)}}."
+            f"{name} has no measures: add measures = {{name: Measure(label, unit)}} to the class."
         )
     if goal.ends not in ENDS:
-        raise ConfigError(f"{name} has ends {show(goal.ends)}: give {', '.join(ENDS)}.")
+        raise ConfigError(f"{name} has ends {show(goal.ends)}: give one of {', '.join(ENDS)}.")
     for each in _FIXED:
         if getattr(type(goal), each) is not getattr(Goal, each):
-            raise ConfigError(f"{name} defines {each}, which both engines share: rename it.")
+            raise ConfigError(f"{name} defines {each}, which goals must not change: rename it.")
 
 
 def _check_shapes(name: str, first: Any, turn: Turn, robots: int) -> None:
@@ -103,13 +103,13 @@ def _check_state(name: str, before: Any, after: Any) -> None:
     """Refuses a state that changes its shapes, or is no array or tuple of arrays."""
     if not _is_plain(before):
         raise ConfigError(
-            f"{name} has the state {type(before).__name__}: return an array, or a tuple of arrays."
+            f"{name} has a {type(before).__name__} as state: return an array or a tuple of arrays."
         )
     shapes = [jax.tree.map(lambda x: (x.shape, x.dtype.name), each) for each in (before, after)]
     if shapes[0] != shapes[1]:
         raise ConfigError(
-            f"{name} returns another state from advance than from begin: return arrays of the same "
-            f"shapes and types, here {shapes[0]}."
+            f"{name} returns a state from advance that differs from that of begin: return arrays "
+            f"of the same shapes and types, here {shapes[0]}."
         )
 
 
