@@ -14,16 +14,16 @@ import numpy as np
 from swarmjax.sim.config import RobotConfig
 
 Array = Any
-Changes = dict[str, tuple[Any, Array]]  # by field of the model: rows, new values
+Changes = dict[str, tuple[Any, Array]]  # for each changed field of the model: rows, new values
 
 
 class Chassis(NamedTuple):
-    """Properties of the chassis in an episode; None keeps the config's value.
+    """Properties of the robots' chassis in an episode; None keeps the config's value.
 
     Attributes:
-      wheel_radius: [R, 2] left and right, m, or None.
+      wheel_radius: [R, 2] radii of the left and right wheel, m, or None.
       track: [R] distance between the points where the wheels grip the floor, m, or None.
-      mass: [R] kg, or None.
+      mass: [R] mass of the whole robot, kg, or None.
       friction: [R] friction between wheels and floor, or None.
     """
 
@@ -37,15 +37,19 @@ AS_BUILT = Chassis()
 
 
 class Rows(NamedTuple):
-    """Rows of the robots in the model's arrays.
+    """The rows of the model's arrays that belong to each robot.
 
     Attributes:
-      bodies: [R, B] hull first.
-      dofs: [R, D].
-      actuators: [R, U]; [R, 0] for a model with forces as servos.
-      wheel_geoms: [R, 2] left and right; [R, 0] for a body without wheels.
-      wheel_bodies: [R, 2] left and right; [R, 0] for a body without wheels.
-      grips: [R, 2] pairs of wheel and floor; [R, 0] for a body without wheels.
+      bodies: [R, B] rows of the bodies; the hull comes first.
+      dofs: [R, D] rows of the degrees of freedom.
+      actuators: [R, U] rows of the actuators; [R, 0] for a model without actuators, where servos
+        are forces on joints.
+      wheel_geoms: [R, 2] rows of the geoms of the left and right wheel; [R, 0] for a body without
+        wheels.
+      wheel_bodies: [R, 2] rows of the bodies of the left and right wheel; [R, 0] for a body without
+        wheels.
+      grips: [R, 2] rows of the contact pairs of left wheel and floor, and of right wheel and floor;
+        [R, 0] for a body without wheels.
     """
 
     bodies: np.ndarray
@@ -57,13 +61,14 @@ class Rows(NamedTuple):
 
 
 class Servos(NamedTuple):
-    """Servos: actuators in MuJoCo C; forces on joints in MJX, where actuators cost time.
+    """Servos in two forms: actuators for MuJoCo C, and joint forces for MJX (faster there).
 
     Attributes:
-      add: adds actuators to the robots of these names in a spec; takes the physics step (s).
+      add: adds actuators to a spec, for the robots with the given names. The last argument is the
+        physics step (s).
       force: returns the servo forces on the joints at the beginning of a physics step, [..., R * V]
         N or N m. Takes qpos [..., R * Q], qvel [..., R * V], ctrl [..., R * U], a chassis, the
-        config's numbers and the physics step (s).
+        settings of the robot, the physics step (s) and the array module.
     """
 
     add: Callable[[mujoco.MjSpec, list[str], RobotConfig, float], None]
@@ -72,18 +77,23 @@ class Servos(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One kind of body, as functions.
+    """The functions of one kind of body.
 
     Attributes:
       gravity: whether gravity acts along any of the body's joints.
       cone: friction cone of the body's contacts.
-      add: adds a robot of this name to a spec, and returns its contact geom; takes the physics step
-        (s).
-      qpos: joint positions [..., R * Q] of robots at rest at [..., R, 3] x (m), y (m), yaw (rad).
-      pose: poses [..., R, 3] of robots with joint positions [..., R * Q]; the inverse of `qpos`.
-      ctrl: controls [..., R * U] that give a chassis the wheel speeds [..., R, 2] (rad/s).
-      changes: changes that a chassis makes to the compiled model; the model is the last argument.
-      servos: servos that follow `ctrl` and that a spec may omit; None if `add` adds the servos.
+      add: adds a robot with the given name to a spec, and returns the name of the geom that makes
+        contact. The last argument is the physics step (s).
+      qpos: returns the joint positions [..., R * Q] of robots at rest at the poses [..., R, 3]: x
+        (m), y (m), yaw (rad).
+      pose: returns the poses [..., R, 3] of robots with joint positions [..., R * Q]; the inverse
+        of `qpos`.
+      ctrl: returns the controls [..., R * U] that make the wheels of a chassis turn at the speeds
+        [..., R, 2] (rad/s).
+      changes: returns the changes that a chassis makes to the compiled model, which is the last
+        argument.
+      servos: the servos that follow `ctrl`, for a body whose `add` does not add them; None if `add`
+        adds the servos.
     """
 
     gravity: bool
@@ -97,7 +107,7 @@ class Body:
 
 
 def find_rows(model: mujoco.MjModel, robots: int) -> Rows:
-    """Looks up the rows of the robots by name.
+    """Looks up by name which rows of the model's arrays belong to each robot.
 
     Args:
       model: compiled.
@@ -132,9 +142,10 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
       model: compiled.
 
     Returns:
-      Changes of the bodies. The changes include the inverse weights. MuJoCo softens contacts with
-      these weights, and MJX does not recompute them. The weights shrink in proportion to the mass.
-      This scaling is exact except for the share of the wheel motors.
+      The changed rows of the bodies and degrees of freedom. They include MuJoCo's inverse weights,
+      which set how soft contacts are and which MJX does not recompute. The inverse weights are
+      divided by `ratio`. This is exact except for the part of the weights that stems from the wheel
+      motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {
@@ -147,5 +158,5 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
 
 
 def _pair(model: mujoco.MjModel, geom: int) -> int:
-    """Returns the single pair that contains a wheel's geom."""
+    """Returns the row of the only contact pair that contains a wheel's geom."""
     return int(np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom))[0])

@@ -7,25 +7,26 @@ from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim import sensors
 
-# m; passages follow the hull (`passage` in task/stage_config.py). A passage of this hull is 0.41 m
-# wide, a tenth of the largest arena.
+# m; wider hulls make wider passages (`passage` in task/stage_config.py). A passage for this hull is
+# 0.41 m wide, a tenth of the largest arena's side.
 LARGEST_HULL = 0.15
 _HULL_REASON = (
     "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
 )
-# Limits for MuJoCo's geometry, float32 and arenas of 0.4 to 4 m. An e-puck drives at 0.13 m/s.
-LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of the numbers that are used as divisors
+# Within these limits, MuJoCo's geometry and float32 work in arenas of 0.4 to 4 m. For comparison,
+# an e-puck drives at 0.13 m/s.
+LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of all settings that code divides by
 _FASTEST = 5.0  # m/s
 _SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
 _FASTEST_TURN = 50.0  # rad/s
 _TURN_REASON = "a faster turn makes more than one rotation in a control step of 0.128 s"
 FASTEST_WHEEL = 1000.0  # rad/s
 MOST_FRICTION = 10.0
-_ROUNDING = 1e-6  # relative; of a product of decimal numbers
+_ROUNDING = 1e-6  # relative rounding error allowed in a product of decimal numbers
 FRICTION_REASON = "rubber on rubber has less than 2"
 # With less friction, MuJoCo's pyramidal cone makes a wheeled robot's contact too stiff for float32.
-# The crowds of tests/sim/test_rubbing.py were off by 1e-4 with friction 0.1 and by 1e-3 with 0.05,
-# and not finite with 0.001.
+# The results for the crowds of tests/sim/test_rubbing.py were wrong by 1e-4 with friction 0.1 and
+# by 1e-3 with friction 0.05; with friction 0.001, they were not finite.
 LEAST_HULL_FRICTION = 0.1
 MOST_HULL_FRICTION = 2.0
 HULL_FRICTION_REASON = "rubber on rubber has less than 2, and plastic has less than that"
@@ -33,7 +34,7 @@ HULL_FRICTION_REASON = "rubber on rubber has less than 2, and plastic has less t
 
 @dataclass(frozen=True, kw_only=True)
 class RobotConfig(Section):
-    """The robot; the default values are the e-puck's, with their sources in epuck.py."""
+    """Settings of the robot. The defaults are the e-puck's; epuck.py gives their sources."""
 
     body: Literal["planar", "wheeled"] = setting(
         "planar", "planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"
@@ -127,10 +128,10 @@ class RobotConfig(Section):
 
     @property
     def wheel_inertia(self) -> list[float]:
-        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the mass.
+        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the wheel's mass.
 
-        The radius is left out. About the axle, the motor's inertia outweighs the wheel by far, and
-        about the upright axis the body takes the rest of `yaw_inertia`.
+        The values do not depend on the radius. About the axle, the motor's inertia is far larger
+        than the wheel's. About the upright axis, the body makes up the rest of `yaw_inertia`.
         """
         return [self.wheel_mass / epuck.WHEEL_MASS * part for part in epuck.WHEEL_INERTIA]
 
@@ -164,8 +165,8 @@ class RobotConfig(Section):
                 f"mass is {show(self.mass)}, but wheel_mass is {show(self.wheel_mass)} and mass "
                 f"includes both wheels: give more than {show(2 * self.wheel_mass)}."
             )
-        # For each wheel: its inertia about its own upright axis, plus that of a point mass on the
-        # axle.
+        # Each wheel contributes its inertia about its own upright axis, plus the inertia of a point
+        # mass at the end of the axle.
         wheels = 2 * (self.wheel_inertia[2] + self.wheel_mass * (0.5 * self.track) ** 2)
         if self.body == "wheeled" and self.yaw_inertia <= wheels:
             raise ConfigError(

@@ -1,6 +1,6 @@
 """Chooses the faster code of `sim/fast/` where it exists, and plain code elsewhere.
 
-The rest of this package uses plain MJX and plain loops.
+The other modules of this package use plain MJX and plain loops.
 """
 
 import importlib
@@ -23,25 +23,26 @@ if TYPE_CHECKING:
     from swarmjax.sim.model import Ids
 
 Array = Any
-# Limits of iterations and line-search steps. With `jax`, these limits stop MJX's Newton method once
-# its result is close enough: in contacts of planar robots, 3 x 5 was at most 6.4e-6 m off converged
-# MuJoCo C, and 2 x 4 up to 2.9e-4 m. With all other limits, solvers can converge.
+# Limits of iterations and line-search steps. With `jax`, the limits in `_NEWTON_STEPS` stop MJX's
+# Newton method once its result is close enough. In contacts of planar robots, its result differed
+# from converged MuJoCo C by at most 6.4e-6 m with 3 iterations of 5 steps, and by up to 2.9e-4 m
+# with 2 iterations of 4 steps. All other limits are high enough for solvers to converge.
 _NEWTON_STEPS = {"planar": (3, 5), "wheeled": (30, 20)}
-_MOST_STEPS = (100, 50)  # MuJoCo's own
-# Limit for discs: the tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps. The error
-# of that jam was 1.9e-4 with 100 sweeps and 4e-6 with 200 sweeps; with MJX's own step it was
-# 2.4e-5. On an H200, 200 sweeps cost 1.5 % of training time.
+_MOST_STEPS = (100, 50)  # MuJoCo's own limits
+# Limit of sweeps for discs. The tightest jam of tests/sim/test_solver.py takes 150 to 200 sweeps.
+# The error in that jam was 1.9e-4 with 100 sweeps, 4e-6 with 200 sweeps, and 2.4e-5 with MJX's own
+# step. On an H200, a limit of 200 sweeps costs 1.5 % of training time.
 _MOST_SWEEPS = 200
 # Forces settle more slowly between hulls with friction. A jam with friction 1.5 takes 400 sweeps to
-# get as close as one without friction. With `jax`, MJX's Newton method takes as many steps as for
-# wheels.
+# get as close to MuJoCo C as a jam without friction. With `jax`, hulls with friction get the same
+# limits of MJX's Newton method as the wheeled body.
 _MOST_RUBBING_SWEEPS = 400
-# In a jam of 10 to 20 wheeled robots, the solver made for wheels would leave an error of up to
-# 7 mm/s.
+# Largest number of wheeled robots that the solver made for wheels handles. In a jam of 10 to 20 of
+# them, it would leave an error of up to 7 mm/s.
 MOST_WHEELED = 5
-MOST_PIECES = 16  # objects processed one by one; the program grows with their number
-MOST_COMPARED = 100  # robots of which all pairs are compared
-_UNROLLED = 8  # objects of one round of a loop; 4 and 16 were no faster
+MOST_PIECES = 16  # most objects that `pieces` splits; each piece makes the program longer
+MOST_COMPARED = 100  # up to this number of robots, all pairs are compared
+_UNROLLED = 8  # objects per iteration of an unrolled loop; 4 and 16 were no faster
 
 
 def resolve_impl(impl: str) -> str:
@@ -192,11 +193,11 @@ def load_fast(name: str, impl: str) -> ModuleType | None:
 
 
 def has_cells(robots: int, listed: int) -> bool:
-    """Returns whether robots look for others in cells; else all pairs are compared.
+    """Returns whether robots look for others in grid cells; otherwise all pairs are compared.
 
     Args:
       robots: number of robots.
-      listed: how many robots the cells list for each robot.
+      listed: how many robots each robot would be compared with if cells were used.
     """
     return robots > max(MOST_COMPARED, listed)
 
@@ -204,16 +205,17 @@ def has_cells(robots: int, listed: int) -> bool:
 def pieces(count: int, xp: Any) -> list[slice]:
     """Splits an axis of objects into slices, so that XLA makes one kernel of the computation.
 
-    On a GPU, a minimum over four obstacles becomes its own kernel, which reads its inputs from
-    memory. One by one, all operations are elementwise, and XLA keeps the values in registers.
+    On a GPU, a minimum over an axis of four obstacles becomes its own kernel, which reads its
+    inputs from memory. If obstacles are processed one by one, all operations are elementwise, and
+    XLA keeps the values in registers.
 
     Args:
       count: number of objects.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      Slices that cover the axis, one per object. A single slice for many objects, for none, and for
-      NumPy, where every call costs time.
+      Slices that cover the axis, one per object. If there are no objects or more than
+      `MOST_PIECES`, or with NumPy, where every call costs time, there is a single slice.
     """
     if xp is np or not 0 < count <= MOST_PIECES:
         return [slice(None)]
@@ -229,7 +231,7 @@ def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [...] at most `limit`.
+      [...] the minimum, or `limit` if that is smaller.
     """
     found = limit
     for value in values:
@@ -240,13 +242,13 @@ def least(values: Iterable[Array], limit: float, xp: Any) -> Array:
 def in_turn[T](step: Callable[[T, Any], T], first: T, things: Any) -> T:
     """Folds a step over many objects, one by one, in JAX.
 
-    On a CPU, XLA computes a minimum over the last axis without vector instructions. Object by
-    object, all operations are elementwise. For the rays of 1,024 robots and 256 boxes, this was
-    nine times as fast.
+    On a CPU, XLA computes a minimum over the last axis without vector instructions. If objects are
+    processed one by one, all operations are elementwise, and XLA uses vector instructions. For the
+    rays of 1,024 robots and 256 boxes, this was nine times as fast.
 
     Args:
       step: takes the result so far and one object; returns the new result.
-      first: result for no objects.
+      first: the result if there are no objects.
       things: arrays [N, ...] of the objects.
 
     Returns:

@@ -36,7 +36,8 @@ def command(action: Array, drive: Drive, xp: Any) -> Array:
     """Clips an action to -1..1 and scales it to a command.
 
     Args:
-      action: [..., 2], any real number; -1 and 1 are the ends of the command's range.
+      action: [..., 2] forward speed and turn rate, any real numbers; -1 and 1 are the ends of the
+        command's range.
       drive: the drive.
       xp: `numpy` or `jax.numpy`.
 
@@ -51,8 +52,8 @@ def command(action: Array, drive: Drive, xp: Any) -> Array:
 def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
     """Computes the wheel speeds of a command, with each wheel clamped to its own limit.
 
-    The robot clamps each wheel separately, so a command for a high speed loses its turn first.
-    Above v = 0.2072 m/s, the turn is lost entirely.
+    The robot clamps each wheel separately, so a turn at high speed becomes wider. Above v = 0.2072
+    m/s, an e-puck does not turn at all: both wheels are at their limit.
 
     Args:
       command: [..., 2] forward speed (m/s) and turn rate (rad/s).
@@ -60,7 +61,7 @@ def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., 2] left and right wheel speed, rad/s, within +-max_wheel_speed.
+      [..., 2] speeds of the left and right wheel, rad/s, within +-max_wheel_speed.
     """
     half_turn = command[..., 1] * (0.5 * drive.track)
     speeds = xp.stack([command[..., 0] - half_turn, command[..., 0] + half_turn], axis=-1)
@@ -68,7 +69,7 @@ def wheel_speeds(command: Array, drive: Drive, xp: Any) -> Array:
 
 
 def body_velocity(wheels: Array, wheel_radius: Array, track: Array, xp: Any) -> Array:
-    """Computes the velocity of the body that rolls on these wheels without slip.
+    """Computes the velocity of a body that rolls without slip on wheels with the given speeds.
 
     Args:
       wheels: [..., 2] left and right wheel speed, rad/s.

@@ -1,4 +1,4 @@
-"""Engines that take a physics step of one arena; the default is MJX's own step, unpatched."""
+"""Engines that step the physics of one arena; this file holds MJX's own step, unpatched."""
 
 import contextlib
 import io
@@ -11,16 +11,19 @@ import mujoco
 import numpy as np
 from jax import Array
 
-# Warp stores the pairs of geoms that may touch, those of all arenas together. It compares spheres
-# around geoms, and the spheres around walls hold all robots. So it gets memory for all walls and
-# boxes of each robot, and for this average number of other robots, far more than a swarm meets.
+# Warp stores the pairs of geoms that may touch, for all arenas together. It compares spheres around
+# geoms, and the sphere around a wall contains all robots. So for each robot, Warp gets memory for
+# pairs with all walls and boxes, and with this number of other robots on average. A robot of a
+# swarm is near far fewer others on average.
 OTHERS_PER_ROBOT = 3
-# Most contacts per robot in one arena. A disc touches at most six neighbours of its size at once.
+# Largest number of contacts per robot in one arena. A disc touches at most six discs of its own
+# size at once.
 ROWS_PER_ROBOT = 6
-_STARTING = threading.Lock()  # `train` starts Warp in a thread, and two starts would make two of it
-FEW_ARENAS = 64  # up to this number, all arenas may be crowded, so every pair gets memory
+_STARTING = threading.Lock()  # `train` starts Warp in a thread; two starts would create Warp twice
+FEW_ARENAS = 64  # up to this number of arenas, every pair of geoms gets memory: all may be crowded
 
-# Types of MJX, in either implementation, or of a faster engine with the same field names.
+# Model and data of MJX (in either implementation), or of a faster engine that uses the same field
+# names.
 Model = Any
 Data = Any
 
@@ -32,9 +35,9 @@ class Engine:
     Attributes:
       label: description of the engine.
       model: model of one arena, on the device.
-      template: data of one arena, to fill in.
-      step: takes model, data, side [] (m) and obstacles [M, 5], and returns the data one physics
-        step later.
+      template: data of one arena, whose fields are replaced by those of a real state.
+      step: takes the model, the data, the arena's side [] (m) and the obstacles [M, 5], and returns
+        the data one physics step later.
       is_mjx: whether MJX takes the steps. The engine's model and data then hold obstacles and
         walls. Any other engine gets obstacles and walls as arguments, and its model has only the
         fields that the engine reads.
@@ -76,7 +79,7 @@ def load_mjx(model: mujoco.MjModel, robots: int, impl: str, arenas: int) -> Engi
 
 
 def step_mjx(model: Model, data: Data, _side: Array, _obstacle: Array) -> Data:
-    """Takes one physics step with `mjx.step`; model and data hold obstacles and walls."""
+    """Takes one physics step with `mjx.step`, which finds obstacles and walls in model and data."""
     return import_mjx().step(model, data)
 
 
@@ -100,7 +103,7 @@ def start_warp() -> None:
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
-    """Returns sizes of Warp's memory: contacts of all arenas, and solver rows of each arena."""
+    """Returns how many contacts of all arenas and solver rows of each arena Warp has memory for."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = _rows(model)
     of_world = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any(axis=0)
@@ -115,7 +118,7 @@ def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
 
 
 def _rows(model: mujoco.MjModel) -> np.ndarray:
-    """Returns how many solver rows [P] a contact of each pair takes."""
+    """Returns for each pair of geoms how many solver rows its contact takes, [P]."""
     if model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         return model.pair_dim
     return np.where(model.pair_dim == 1, 1, 2 * (model.pair_dim - 1))

@@ -1,4 +1,4 @@
-"""Signed gaps between hulls and the objects around them, and contacts counted from the gaps."""
+"""Computes signed gaps between hulls and the objects around them, and counts contacts by them."""
 
 from typing import Any
 
@@ -30,9 +30,10 @@ def gaps(
       near: the robots near each robot; None compares all pairs.
 
     Returns:
-      [R, 3] m, in the order of `KINDS`; `inf` without an object of that kind. With `near`, gaps
-      between robots are exact up to the limit that these were found with. A larger gap is given as
-      any number above that limit, or `inf`; contacts need only gaps of at most 0.
+      [R, 3] m, in the order of `KINDS`; `inf` if there is no object of that kind. With `near`, a
+      gap between robots is exact up to the `limit` that `near` was found with; a larger gap is
+      returned as any number above that limit, or as `inf`. This is enough for contacts, whose gaps
+      are at most 0.
     """
     x, y = pose[:, :1], pose[:, 1:2]
     other_x, other_y, myself = others(pose, near, xp)
@@ -64,15 +65,15 @@ def count_contacts(gap: Array, apart: Array, control_step: float, xp: Any) -> tu
     """Counts contacts: a contact begins when a gap closes after it has been open for a while.
 
     Args:
-      gap: [..., R, 3] gaps now, m.
-      apart: [..., R, 3] time for which the gap has been open, s.
+      gap: [..., R, 3] current gaps, m.
+      apart: [..., R, 3] for how long each gap had been open before now, s.
       control_step: s.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [..., R, 3] whether a contact begins, and the new `apart`.
+      Two arrays [..., R, 3]: whether a contact begins now, and the new `apart`.
     """
     touching = gap <= 0.0
-    # Half a step of slack, because sums of control steps do not match the pause exactly.
+    # Subtract half a control step, because rounded sums of control steps may just miss the pause.
     begins = touching & (apart > CONTACT_PAUSE - 0.5 * control_step)
     return begins, xp.where(touching, 0.0, apart + control_step)

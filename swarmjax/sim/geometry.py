@@ -1,4 +1,4 @@
-"""Geoms that can touch only through an explicit pair."""
+"""Adds geoms that can touch only if an explicit contact pair names them."""
 
 from collections.abc import Sequence
 
@@ -8,11 +8,12 @@ from swarmjax import epuck
 
 HULL_GROUP = 3  # contact spheres, which rays ignore
 FLOOR_GROUP = 4  # wheels, skids and floor, which rays ignore; wheels reach beyond the hull
-# Contacts are between a sphere at the height of the robot's centre of mass and upright faces. In
-# the plane this is exactly a disc of the hull's radius. A sphere needs one contact point per pair,
-# while a capsule needs two. A push neither tips the robot nor puts extra load on a skid.
+# A hull makes contact as a sphere at the height of the robot's centre of mass, and all other faces
+# are upright. In the plane, the sphere acts exactly like a disc of the hull's radius. A sphere
+# needs one contact point per pair, while a capsule needs two. A push neither tips the robot nor
+# puts extra load on a skid.
 CONTACT_HEIGHT = epuck.COM_HEIGHT
-SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's default torsional and rolling friction; condim 3 ignores it
+SPIN = 5e-3, 1e-4, 1e-4  # MuJoCo's default torsional and rolling friction, unused with condim 3
 
 
 def add_geom(
@@ -31,7 +32,7 @@ def add_geom(
       kind: shape.
       size: three numbers, m, with MuJoCo's meaning for the shape.
       place: position in the frame of the body, m.
-      group: determines which rays see the geom.
+      group: the geom group, by which rays choose what they see.
 
     Returns:
       `name`.
@@ -43,7 +44,7 @@ def add_geom(
 
 
 def add_hull(body: mujoco.MjsBody, name: str, radius: float) -> str:
-    """Adds the hull that makes contact, and returns its name.
+    """Adds the hull geom that makes contact, and returns the geom's name.
 
     Args:
       body: body of the robot, with its origin on the floor.

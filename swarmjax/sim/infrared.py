@@ -1,9 +1,9 @@
 """The infrared rays of robots, computed from the geometry of walls, discs and turned boxes.
 
 There is one function per shape. Each function returns the distance at which a ray meets the shape,
-`inf` for a miss, and 0 for a ray that starts inside. The e-puck's sensors sit 3.5 to 6 mm
-behind the hull's surface, so a robot pressed against an object has its sensor inside that object.
-Runs on NumPy or JAX.
+`inf` for a ray that misses it, and 0 for a ray that starts inside it. The e-puck's sensors sit 3.5
+to 6 mm behind the hull's surface, so a robot pressed against an object has its sensor inside that
+object. The code runs on NumPy or JAX.
 """
 
 import itertools
@@ -17,17 +17,18 @@ from swarmjax.sim.dispatch import in_turn, least, pieces
 from swarmjax.sim.neighbours import Near, others
 
 Array = Any
-# Objects of one kind: distances (m) along rays, as pieces [..., R, K, N], and their reflectances
-# [..., R or 1, K or 1, N]; None for 1.
+# Objects of one kind: their distances (m) along rays, in pieces [..., R, K, N], and their
+# reflectances [..., R or 1, K or 1, N]; None if all reflectances are 1.
 _Thing = tuple[list[Array], Array | None]
 
 
 class Mount(NamedTuple):
-    """How the sensors of robots are mounted.
+    """Where the sensors of robots sit, and where they point.
 
     Attributes:
       poses: x (m), y (m) and yaw (rad) of each sensor in the frame of the robot.
-      turn: [..., K] by how much each sensor is turned to the left of its nominal yaw, rad; None: 0.
+      turn: [..., K] angle by which each sensor is turned to the left of its nominal yaw, rad; None
+        if all are 0.
     """
 
     poses: Sequence[Sequence[float]] = epuck.SENSOR_POSES
@@ -41,8 +42,8 @@ class Reflectance(NamedTuple):
     """Reflectances of surfaces, above 0 and at most 1; None means 1.
 
     Attributes:
-      fixture: [..., 1 + M] of all walls, and of each obstacle.
-      robot: [..., R].
+      fixture: [..., 1 + M] one reflectance for all walls, then one for each obstacle.
+      robot: [..., R] reflectance of each robot.
     """
 
     fixture: Array | None = None
@@ -50,7 +51,7 @@ class Reflectance(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """Rays in the world frame; separate coordinate arrays spare XLA any gathering.
+    """Rays, by default in the world frame; separate coordinate arrays spare XLA gather operations.
 
     Attributes:
       x: [...] x of the origin, m.
@@ -66,15 +67,15 @@ class Ray(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Turned rectangles, with sine and cosine computed once for all rays.
+    """Turned rectangles, with sine and cosine of the yaw computed once for all rays.
 
     Attributes:
       x: [...] x of the centre, m.
       y: [...] y of the centre, m.
       cos: [...] cosine of the yaw.
       sin: [...] sine of the yaw.
-      half_x: [...] half edge, m.
-      half_y: [...] half edge, m.
+      half_x: [...] half edge along the rectangle's own x axis, m.
+      half_y: [...] half edge along the rectangle's own y axis, m.
     """
 
     x: Array
@@ -85,7 +86,7 @@ class Box(NamedTuple):
     half_y: Array
 
     def at(self, index: Any) -> "Box":
-        """Indexes each of the arrays."""
+        """Returns the rectangles at an index, applied to each of the arrays."""
         return Box(*(part[index] for part in self))
 
 
@@ -98,7 +99,8 @@ def rays(pose: Array, xp: Any, mount: Mount = EPUCK) -> tuple[Array, Array]:
       mount: how the sensors are mounted.
 
     Returns:
-      Origins and unit directions, [..., K, 2] each, world frame.
+      Two arrays [..., K, 2] in the world frame: the origins (m) and the unit directions of the
+      rays.
     """
     x, y, toward_x, toward_y = _cast(pose, xp, mount)
     return xp.stack([x, y], axis=-1), xp.stack([toward_x, toward_y], axis=-1)
@@ -117,7 +119,7 @@ def _cast(pose: Array, xp: Any, mount: Mount) -> Ray:
 
 
 def mounted(mount: Mount, xp: Any) -> Ray:
-    """Returns rays [K] or [..., K] in the frames of the robots; angle sums turn them further.
+    """Returns rays [K] or [..., K] in the frames of the robots; rotate them by a robot's yaw.
 
     Args:
       mount: how the sensors are mounted.
@@ -148,7 +150,7 @@ def ray_walls(ray: Ray, half: Array, xp: Any) -> Array:
 
 
 def _to_wall(at: Array, toward: Array, half: Array, xp: Any) -> Array:
-    """Returns the distance [...] to the wall ahead, one of the two walls across an axis."""
+    """Returns the distance [...] to the wall ahead, of the two walls perpendicular to one axis."""
     pace = xp.maximum(xp.abs(toward), 1e-9)  # a ray along a wall never meets it
     return (half - xp.where(toward < 0.0, -at, at)) / pace
 
@@ -204,7 +206,7 @@ def _cross(at: Array, toward: Array, half: Array, xp: Any) -> tuple[Array, Array
 
 
 def turned(box: Array, xp: Any) -> Box:
-    """Splits rectangles [..., 5]: x (m), y (m), yaw (rad) and half edges (m)."""
+    """Converts rectangles [..., 5] to `Box`: x (m), y (m), yaw (rad), half edges (m)."""
     x, y, yaw, half_x, half_y = (box[..., i] for i in range(5))
     return Box(x, y, xp.cos(yaw), xp.sin(yaw), half_x, half_y)
 
@@ -224,7 +226,7 @@ def distances(
     mount: Mount = EPUCK,
     near: Near | None = None,
 ) -> Array:
-    """Returns the exact distances that the infrared sensors of a swarm see.
+    """Returns the exact distances from the infrared sensors of a swarm to what they see.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
@@ -257,11 +259,11 @@ def sights(
     mount: Mount,
     near: Near | None = None,
 ) -> tuple[Array, Array]:
-    """Returns what the infrared sensors of a swarm see: distances and reflectances.
+    """Returns the distances and reflectances of what the infrared sensors of a swarm see.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad) of the robots; absent ones are parked far away.
-        [R, 3] with `near`. The array module is the one of `pose`.
+        [R, 3] with `near`. If this is a NumPy array, the code runs on NumPy, otherwise on JAX.
       side: [...] side of the arena, m.
       obstacle: [..., M, 5] x (m), y (m), yaw (rad), half edges (m).
       hull_radius: m.
@@ -271,9 +273,9 @@ def sights(
       near: the robots near each robot, found with this `limit`; None compares all pairs.
 
     Returns:
-      Distance [..., R, K] from the sensor's origin to the nearest surface, m, 0..limit; and the
-      reflectance [..., R, K] of that surface, 1 where there is none. At equal distances, the
-      brightest takes precedence.
+      The distance [..., R, K] from each sensor's origin to the nearest surface, m, 0..limit, and
+      the reflectance [..., R, K] of that surface. The reflectance is 1 where there is no surface
+      within `limit`. If several surfaces are equally near, it is that of the brightest.
     """
     xp = pose.__array_namespace__()
     nearest, bright = xp.inf, 1.0
@@ -287,7 +289,7 @@ def sights(
 
 
 def _brightest(reaches: list[Array], here: Array, shade: Array | None, xp: Any) -> Array | float:
-    """Returns reflectances [..., R, K] of objects of one kind that rays meet at distance `here`."""
+    """Returns the largest reflectance [..., R, K] of the objects that rays meet at `here` (m)."""
     if shade is None:
         return 1.0
     found = 0.0
@@ -308,7 +310,7 @@ def _things(
     near: Near | None,
     xp: Any,
 ) -> tuple[_Thing, _Thing, _Thing]:
-    """Returns walls, other robots and obstacles, as the rays of a swarm meet them."""
+    """Returns distances and reflectances of walls, other robots and obstacles, for all rays."""
     ray = _cast(pose, xp, mount)
     wall = ray_walls(ray, 0.5 * side[..., None, None], xp)[..., None]
     x, y, myself = others(pose, near, xp)
@@ -335,7 +337,7 @@ def _pick(shade: Array | None, index: Any) -> Array | None:
 
 
 def _boxes_in_turn(ray: Ray, box: Box, shades: Array | None, xp: Any) -> _Thing:
-    """Returns the nearest of many obstacles [M] that rays [R, K] meet, as one obstacle per ray."""
+    """Returns the nearest obstacle for each ray [R, K], by going through all obstacles in turn."""
 
     def meet(found: tuple[Array, Array], one: tuple[Box, Array]) -> tuple[Array, Array]:
         (here, bright), (each, shade) = found, one

@@ -1,7 +1,8 @@
 """Builds the MuJoCo model of one arena: robots, obstacles and walls.
 
-A stage changes only poses and sizes (side, obstacles, presence), which are set at run time. The
-model itself is compiled once, for the largest case. This module uses MuJoCo only, no JAX.
+Stages differ only in poses and sizes: the arena's side, the obstacles, and which robots and
+obstacles are present. These are set at run time, so the model is compiled only once, for the
+largest case. This module uses MuJoCo only, no JAX.
 """
 
 import copy
@@ -18,15 +19,16 @@ from swarmjax.sim.geometry import SPIN, add_geom, add_ray_hull
 from swarmjax.sim.planar import PLANAR
 from swarmjax.sim.wheeled import WHEELED
 
-WALL_HALF_THICKNESS = 0.05  # m; a robot sinks at most 4 mm into a wall, so none gets through
+WALL_HALF_THICKNESS = 0.05  # m; a robot sinks at most 4 mm into a wall, so no robot gets through
 WALL_HALF_LENGTH = 20.5  # m; longer than half the largest arena (40 m)
 HALF_HEIGHT = 0.05  # m; walls and obstacles are 0.1 m high (Webots RectangleArena)
 WALLS = 4
 BODIES: dict[str, Body] = {"planar": PLANAR, "wheeled": WHEELED}
-# Representation of obstacles and walls. When MuJoCo C compiles geoms of the world, it precomputes
-# data for them (`geom_sameframe`, a bounding hierarchy for rays). So in MuJoCo C they are movable
-# bodies. MJX does not use that data, and every body costs time in MJX, so in MJX they are geoms of
-# the world. In MJX, every actuator costs time too, so a body's `Servos` are left to the engine.
+# Representation of obstacles and walls. MuJoCo C precomputes data for geoms of the world when it
+# compiles them (`geom_sameframe`, a bounding hierarchy for rays). In MuJoCo C, obstacles and walls
+# are therefore movable bodies. MJX does not use that data, and every body costs time in MJX, so in
+# MJX obstacles and walls are geoms of the world. Every actuator also costs time in MJX, so there
+# the servos are forces (`Servos.force`).
 Fixtures = Literal["mocap", "world"]
 
 
@@ -36,7 +38,7 @@ class ArenaSize(NamedTuple):
     Attributes:
       robots: largest number of robots, R.
       obstacles: largest number of obstacles, M.
-      largest_half: largest half edge of an obstacle, m; Warp's broadphase keeps this bound.
+      largest_half: largest half edge of an obstacle, m; Warp's broadphase always uses this size.
     """
 
     robots: int
@@ -45,16 +47,16 @@ class ArenaSize(NamedTuple):
 
 
 class Ids(NamedTuple):
-    """Rows of objects in the model's arrays.
+    """The rows of the model's arrays that belong to robots, obstacles and walls.
 
     Attributes:
-      fixture_geom: [M + 4] consecutive rows of `geom_size`: obstacles, then walls east, north,
-        west, south.
-      fixture_mocap: [M + 4] rows of `mocap_pos`, in the order of `fixture_geom`; -1 for geoms of
-        the world.
-      obstacle_geom: [M] the first rows of `fixture_geom`.
-      hull_body: [R] bodies of the hulls, for `bodyexclude` of a ray.
-      robots: rows of the robots.
+      fixture_geom: [M + 4] consecutive rows of `geom_size`: first the obstacles, then the east,
+        north, west and south wall.
+      fixture_mocap: [M + 4] rows of `mocap_pos`, in the order of `fixture_geom`; all are -1 if
+        obstacles and walls are geoms of the world.
+      obstacle_geom: [M] the first M entries of `fixture_geom`.
+      hull_body: [R] rows of the hulls' bodies, for a ray's `bodyexclude`.
+      robots: rows of the robots' parts.
     """
 
     fixture_geom: np.ndarray
@@ -78,13 +80,15 @@ def build(
       robot: settings of the robot.
       size: sizes to compile for.
       timestep: one physics step, s.
-      ray_geoms: whether to add the cylinder hulls that rays see; analytic sensors need none.
-      fixtures: `mocap` makes obstacles and walls bodies, for MuJoCo C. `world` makes obstacles and
-        walls geoms of the world, for MJX. At run time, MJX gets the poses of these geoms, and the
-        forces of the servos.
+      ray_geoms: whether to add the cylinder hulls that MuJoCo's rays see; the sensors of
+        `infrared.py` do not need them.
+      fixtures: with `mocap`, obstacles and walls are bodies, for MuJoCo C. With `world`, they are
+        geoms of the world, for MJX; the engine then sets the poses of these geoms and the servo
+        forces at run time.
 
     Returns:
-      The spec, ready to compile. qpos, qvel and ctrl hold each robot in turn, in its body's layout.
+      The spec, ready to compile. qpos, qvel and ctrl hold the values of one robot after the other,
+      in the layout of the robots' body.
     """
     spec = mujoco.MjSpec()
     _set_options(spec, timestep, BODIES[robot.body], rubs=robot.hull_friction > 0.0)
@@ -105,7 +109,7 @@ def build(
 
 
 def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
-    """Looks up the rows of robots, obstacles and walls by name."""
+    """Looks up by name which rows belong to robots, obstacles and walls."""
     boxes = [model.geom(f"{name}_box").id for name in _fixture_names(size)]
     fixture_geom = np.array(boxes, np.int32)
     return Ids(
@@ -120,7 +124,7 @@ def ids(model: mujoco.MjModel, size: ArenaSize) -> Ids:
 def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoco.MjModel:
     """Changes the obstacle sizes of a compiled arena.
 
-    MuJoCo's compiler derives only the bounds of a box from its size.
+    This needs no new compilation: MuJoCo's compiler derives only a box's bounds from its size.
 
     Args:
       model: made by `build` with `fixtures="mocap"`; it stays unchanged.
@@ -128,7 +132,7 @@ def resize_obstacles(model: mujoco.MjModel, ids: Ids, half: np.ndarray) -> mujoc
       half: [M, 2] half edges, m.
 
     Returns:
-      The same model as `build` makes with these sizes.
+      A model equal to one compiled with these sizes.
     """
     found, geoms = copy.copy(model), ids.obstacle_geom
     size = np.column_stack([half, np.full(len(half), HALF_HEIGHT)])
@@ -181,21 +185,22 @@ def _fixture_names(size: ArenaSize) -> list[str]:
 
 
 def _rubbing(friction: float) -> dict[str, Any]:
-    """Returns contact options of a hull: frictionless (condim 1), or with Coulomb friction (3)."""
+    """Returns contact options of hulls: condim 1 without friction, condim 3 with friction."""
     if friction == 0.0:
         return {"condim": 1}
     return {"condim": 3, "friction": [friction, friction, *SPIN]}
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
-    """Selects Euler, as servos are discrete; disables unused features, which cost MJX time."""
+    """Selects Euler, as servos are discrete; disables unused features, since they cost MJX time."""
     if rubs:
         spec.option.cone = body.cone
     spec.option.timestep = timestep
     spec.option.gravity = [0.0, 0.0, -epuck.GRAVITY]
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     off = mujoco.mjtDisableBit
-    # No joint has damping (its factorisation has its own flag), a spring, or dry friction.
+    # No joint has damping (which has two flags: one for its force, one for its factorisation), a
+    # spring, or dry friction.
     spec.option.disableflags |= int(off.mjDSBL_EULERDAMP | off.mjDSBL_DAMPER | off.mjDSBL_SPRING)
     spec.option.disableflags |= int(off.mjDSBL_FRICTIONLOSS)
     if not body.gravity:
@@ -203,7 +208,7 @@ def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, half: float, fixtures: Fixtures) -> str:
-    """Adds a box with a pose that is set at run time, and returns the name of its geom."""
+    """Adds a box, whose pose is set at run time, and returns the name of its geom."""
     world = spec.worldbody
     body = world.add_body(name=name, mocap=True) if fixtures == "mocap" else world
     thickness = WALL_HALF_THICKNESS if name.startswith("wall") else half

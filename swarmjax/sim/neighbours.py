@@ -1,4 +1,4 @@
-"""Which robots may be near each robot, found in cells instead of by comparing all pairs."""
+"""Finds the robots that may be near each robot in grid cells, without comparing all pairs."""
 
 import math
 from typing import Any, NamedTuple
@@ -8,14 +8,16 @@ import numpy as np
 from swarmjax.sim import dispatch
 
 Array = Any
-# A robot looks at three rows of cells. A row is as high as the reach. Cells along a row are narrow,
-# so that those that a robot looks at extend little beyond its reach.
+# A grid of cells covers the plane. The reach is the largest distance between the centres of two
+# robots that are near each other. A row of cells is as high as the reach, so a robot looks at three
+# rows. Cells are narrow along a row, so that the cells that a robot looks at extend only a little
+# beyond its reach.
 ROWS = 3
 _CELLS = 16  # cells per reach along a row
-_ROW = 2**18  # cells of a row; 1,024 parked robots take 72,000
+_ROW = 2**18  # cells in a row; 1,024 robots parked far away take up 72,000 cells of a row
 _SLACK = 1.01  # cells are larger than the reach, because numbers are rounded before `floor`
-# Share of a hull's diameter by which all hulls may overlap. Contacts are soft: in a jam of 100
-# robots that drove into each other, the worst of all pairs overlapped by 0.13.
+# Assumed largest overlap of two hulls, as a share of their diameter. Contacts are soft, so hulls
+# overlap: in a jam of 100 robots that drove into each other, the largest overlap was 0.13.
 _OVERLAP = 0.15
 
 
@@ -23,8 +25,9 @@ class Near(NamedTuple):
     """The robots of an arena that may be near each robot.
 
     Attributes:
-      index: [R, N] robots, each robot itself among them; an index may occur more than once.
-      full: [] whether robots are left out, because more than N are near; bool.
+      index: [R, N] indices of the robots that may be near each robot, including its own index. An
+        index may occur more than once in a row.
+      full: [] bool, whether some robots are left out because more than N may be near.
     """
 
     index: Array
@@ -32,7 +35,7 @@ class Near(NamedTuple):
 
 
 def room(hull_radius: float, limit: float) -> int:
-    """Returns how many robots fit into the cells of a row that one robot looks at.
+    """Returns how many robots fit into the cells that one robot looks at in one row of cells.
 
     At most 2 A / (sqrt(3) d^2) + P / (2 d) + 1 points with distances of at least d fit into a
     convex region with the area A and the perimeter P (Oler 1961, "An inequality in the geometry
@@ -50,14 +53,14 @@ def room(hull_radius: float, limit: float) -> int:
 
 
 def look(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near | None:
-    """Lists the robots near each robot as `find` does; None for a swarm that compares all pairs."""
+    """Calls `find`; returns None for a swarm so small that comparing all pairs is better."""
     if not dispatch.has_cells(len(pose), ROWS * room(hull_radius, limit)):
         return None
     return find(pose, hull_radius, limit, xp)
 
 
 def find(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near:
-    """Lists for each robot at least those whose hulls are within `limit` of its own.
+    """Lists for each robot at least all robots whose hulls are within `limit` of its own hull.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away from each other.
@@ -66,7 +69,7 @@ def find(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The robots near each robot; N is `ROWS` times `room`.
+      The robots that may be near each robot; N is `ROWS` times `room(hull_radius, limit)`.
     """
     count, most = len(pose), room(hull_radius, limit)
     height = np.float32(_SLACK * (2.0 * hull_radius + limit))
@@ -84,15 +87,16 @@ def find(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near:
 
 
 def others(pose: Array, near: Near | None, xp: Any) -> tuple[Array, Array, Array]:
-    """Returns where the robots are that each robot is compared with.
+    """Returns the positions of the robots with which each robot is compared.
 
     Args:
       pose: [..., R, 3] x (m), y (m), yaw (rad); [R, 3] with `near`.
-      near: the robots near each robot; None: all.
+      near: the robots with which each robot is compared; None for all robots.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      x and y (m), [..., 1, R] or [R, N], and whether it is the robot itself, [R, R] or [R, N].
+      x and y (m) of the other robots, [..., 1, R] or [R, N], and whether the "other" robot is the
+      robot itself, [R, R] or [R, N].
     """
     x, y, count = pose[..., 0], pose[..., 1], pose.shape[-2]
     if near is None:

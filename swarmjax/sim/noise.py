@@ -1,7 +1,7 @@
-"""Counter-based random numbers: each number is a hash of where it is used, without any state.
+"""Counter-based random numbers: each number is a hash of its purpose and time, without any state.
 
-The same seed, clock, stream and index give the same number in NumPy and in JAX. A level therefore
-replays exactly, with all its randomness. Do not use these numbers for secrets.
+The same seed, clock, stream and index give the same number in NumPy and in JAX. A level with all
+its randomness therefore replays exactly. These numbers are not secure: do not use them for secrets.
 """
 
 import enum
@@ -16,8 +16,8 @@ Array = Any
 class Stream(enum.IntEnum):
     """Purpose of a random number; values must never change, so that old levels still replay.
 
-    Streams up to `TARGET_COURSE` are drawn once per episode, at clock 0; the others at each
-    control step.
+    Numbers of the streams up to `TARGET_COURSE` are drawn once per episode, at clock 0. Numbers of
+    the other streams are drawn at each control step.
     """
 
     WHEEL_RADIUS = 0
@@ -52,20 +52,21 @@ def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any
     The four words are combined one after the other. Each word is mixed before it is combined, and
     the result is mixed again. So the numbers of one seed are not the shifted numbers of another
     seed, and swapping seed and clock changes the result. The number at an index does not depend on
-    the shape, so adding robots leaves the others' numbers unchanged.
+    the shape, so adding robots does not change the numbers of the existing robots.
 
     Args:
       seed: [...] uint32.
       clock: [...] or [] control steps since the start, 0 or more.
       stream: purpose of the numbers, one of `Stream`.
-      shape: shape of the numbers for one seed; the index counts along the last axis first.
+      shape: shape of the numbers for one seed. The index of a number is its place in this array in
+        row-major order.
       xp: `numpy` or `jax.numpy`; both give the same numbers.
 
     Returns:
       [..., *shape] uint32.
     """
-    # Keep a last axis throughout, because NumPy warns about overflow only for scalars. If the seed
-    # were mixed only once, it would commute with the clock.
+    # Use arrays with at least one axis throughout, because NumPy warns about overflow of scalars.
+    # If the seed were mixed only once, seed and clock would be interchangeable.
     key = _mix(_mix(xp.asarray(seed, xp.uint32)[..., None]))
     index = np.arange(math.prod(shape), dtype=np.uint32)
     for word in (xp.asarray(clock, xp.uint32)[..., None], np.full(1, stream, np.uint32), index):
@@ -74,7 +75,7 @@ def bits(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any
 
 
 def uniform(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
-    """Draws uniform numbers, in steps of 2**-24.
+    """Draws uniform random numbers, multiples of 2**-24.
 
     Args:
       seed: [...] uint32.
@@ -86,17 +87,17 @@ def uniform(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: 
     Returns:
       [..., *shape] float32 in [0, 1).
     """
-    # With more than 24 bits, rounding to a float32 below 1 would make some values equal.
+    # A float32 holds 24 bits. With more bits, rounding would make some values equal, or equal to 1.
     whole = bits(seed, clock, stream, shape, xp) >> 8
     return whole.astype(xp.float32) * np.float32(2.0**-24)
 
 
 def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: Any) -> Array:
-    """Draws standard normal numbers, from two uniform numbers for each pair.
+    """Draws standard normal numbers; each pair of them is computed from two uniform numbers.
 
-    Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of Mathematical
-    Statistics 29 (1958), pages 610-611, equation 1. The logarithm's argument is at least 2**-24, so
-    no result exceeds 5.77 in magnitude.
+    Method: Box and Muller, "A Note on the Generation of Random Normal Deviates", Annals of
+    Mathematical Statistics 29 (1958), pages 610-611, equation 1. The logarithm's argument is at
+    least 2**-24, so the magnitude of a result is at most 5.77.
 
     Args:
       seed: [...] uint32.
@@ -118,10 +119,11 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
 
 
 def _mix(word: Array) -> Array:
-    """Scrambles uint32 one to one: flipping any bit flips each other bit with probability 1/2.
+    """Scrambles uint32 one to one: flipping any input bit flips each output bit half of the time.
 
     This is `triple32inc` from Chris Wellons, "Prospecting for Hash Functions" (2018) and the tables
-    of github.com/skeeto/hash-prospector. Its bias is 0.0208; a perfect hash measures 0.021.
+    of github.com/skeeto/hash-prospector. The tables give it a bias of 0.0208; a perfect hash has a
+    measured bias of 0.021.
     """
     word = word + np.uint32(1)
     word = (word ^ (word >> 17)) * np.uint32(0xED5AD4BB)

@@ -1,9 +1,9 @@
-"""Physics of many arenas on one device: MJX, with `impl=jax` or `impl=warp`.
+"""Steps the physics of many arenas on one device, with MJX or with a faster engine.
 
-The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. This
-state is the same for every engine, and a step reads nothing else. Within a rollout, the engine's
-complete data is carried instead. Rebuilding the data at every control step would cost a quarter of
-the speed.
+The state of an arena is `PhysicsState`: positions, velocities and the solver's warm start. These
+fields are the same for every engine, and they are all that a physics step reads from its
+predecessor. Within a rollout, the engine's complete data is carried from step to step, because
+rebuilding the data from the state at every control step would cost a quarter of the speed.
 """
 
 import functools
@@ -23,7 +23,7 @@ from swarmjax.sim.body import AS_BUILT, Body, Chassis
 from swarmjax.sim.config import RobotConfig
 from swarmjax.sim.engine import Data, Engine, Model
 
-# Places of cosines, sines and ones in a rotation matrix about the z axis.
+# Where a rotation matrix about the z axis has cosines, sines and a one.
 _COSINES = np.diag([1.0, 1.0, 0.0]).astype(np.float32)
 _SINES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], np.float32)
 _ONES = np.diag([0.0, 0.0, 1.0]).astype(np.float32)
@@ -35,9 +35,9 @@ class PhysicsState(NamedTuple):
     """Physical state of an arena, or of many arenas with a leading axis.
 
     Attributes:
-      qpos: [Q] joint positions of each robot in turn, in its body's layout.
-      qvel: [V] joint velocities.
-      qacc_warmstart: [V] starting point of the solver.
+      qpos: [Q] joint positions of one robot after the other, in the layout of the robots' body.
+      qvel: [V] joint velocities of one robot after the other.
+      qacc_warmstart: [V] accelerations from which the solver starts.
     """
 
     qpos: Array
@@ -47,12 +47,12 @@ class PhysicsState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Physics:
-    """The compiled physics, fixed for a program.
+    """The compiled physics, constant within a compiled program.
 
     Attributes:
       engine: takes the physics steps.
       host: the model as compiled by MuJoCo.
-      ids: rows of the moving bodies.
+      ids: rows of robots, obstacles and walls in the model.
       robot: settings of the robot.
       substeps: physics steps per control step.
     """
@@ -65,17 +65,17 @@ class Physics:
 
     @property
     def body(self) -> Body:
-        """The robots' kind of body."""
+        """The functions of the robots' kind of body."""
         return sim_model.BODIES[self.robot.body]
 
 
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
-    """Makes Warp build MJX's kernels now, not at the first step; this takes half a minute.
+    """Makes Warp build MJX's kernels now, which takes half a minute, not at the first step.
 
     Args:
-      physics: the compiled physics, with an engine that `builds_kernels`.
-      states: [A] as many arenas as the program will step, since contact memory depends on their
-        number.
+      physics: the compiled physics, whose engine has `builds_kernels` true.
+      states: states of A arenas. A must be the number of arenas that the program will step, since
+        the size of the contact memory depends on it.
     """
 
     def step_once(state: PhysicsState) -> Array:
@@ -91,7 +91,7 @@ def rest(physics: Physics, pose: Array) -> PhysicsState:
 
 
 def unpack(physics: Physics, state: PhysicsState) -> Data:
-    """Expands the state of one arena to the engine's data, for a rollout."""
+    """Converts the state of one arena to the engine's data, which a rollout carries."""
     return physics.engine.template.replace(**state._asdict())
 
 
@@ -125,8 +125,8 @@ def step(
       data: the arena.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-      wheels: [R, 2] speeds of the left and right wheel that the motors hold, rad/s.
-      chassis: differences of the robots from the config.
+      wheels: [R, 2] speeds of the left and right wheel during this control step, rad/s.
+      chassis: properties in which the robots differ from the config.
 
     Returns:
       The arena, one control step later.
@@ -149,7 +149,7 @@ def step(
 
 
 def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
-    """Applies the servos in the next physics step, as actuators or as forces.
+    """Sets the controls of actuators, or the forces of servos, for the next physics step.
 
     Args:
       physics: the compiled physics.
@@ -158,7 +158,7 @@ def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
       chassis: chassis of the robots.
 
     Returns:
-      The arena, with the controls or forces of the next physics step.
+      The arena's data with these controls or forces.
     """
     servos, timestep = physics.body.servos, physics.host.opt.timestep
     if servos is None:
@@ -168,11 +168,12 @@ def _drive(physics: Physics, data: Data, ctrl: Array, chassis: Chassis) -> Data:
 
 
 def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, Fields]:
-    """Places obstacles and walls of an arena where the implementation reads them.
+    """Writes the poses and sizes of obstacles and walls into the fields that the engine reads.
 
-    `jax` computes the poses of all geoms from the model. `warp` does not compute the poses of geoms
-    of the world, so these poses are set in the data. `warp` overwrites the poses of all other
-    geoms. An engine that is not MJX takes side and obstacles directly.
+    With `impl=jax`, MJX computes the poses of all geoms from the model, so the poses are set in the
+    model. With `impl=warp`, MJX does not compute the poses of geoms of the world, so these poses
+    are set in the data; MJX still overwrites the poses of all other geoms. An engine other than MJX
+    takes side and obstacles as arguments, so nothing is set.
 
     Args:
       physics: the compiled physics.
@@ -180,7 +181,7 @@ def _fixtures(physics: Physics, side: Array, obstacle: Array) -> tuple[Fields, F
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      Fields of the model, and of the data.
+      The new fields of the model, and the new fields of the data.
     """
     if not physics.engine.is_mjx:
         return {}, {}
@@ -203,7 +204,7 @@ def _with_rows(array: Array, rows: Any, first: int) -> Array:
     """Replaces the rows from `first` on.
 
     The function uses `where`, because `.at` would become a scatter under `vmap`. A concatenation
-    would become one branch per part, and a GPU takes all branches.
+    would become a kernel with one branch per part, and a GPU would execute all branches.
     """
     count, end = len(array), first + len(rows)
     row = np.arange(count).reshape(-1, *[1] * (array.ndim - 1))
@@ -224,7 +225,7 @@ def _matrices(yaw: Any, xp: Any) -> Any:
 
 
 def _change(physics: Physics, fields: Fields, chassis: Chassis) -> Model:
-    """Sets the parts of the model that differ between arenas: `fields` and the chassis."""
+    """Returns the model with the values of one arena: `fields`, and the changes by the chassis."""
     model, rows_of = physics.engine.model, physics.ids.robots
     changes = physics.body.changes(chassis, rows_of, physics.robot, physics.host)
     if not physics.engine.is_mjx:  # such a model may lack fields

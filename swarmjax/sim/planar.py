@@ -1,11 +1,12 @@
-"""The planar body: three degrees of freedom, and servos instead of wheels on a floor.
+"""The planar body: three degrees of freedom, moved by servos instead of wheels on a floor.
 
-The planar body trains five times faster than the wheeled body. Servo forces are limited to what
-wheels can pass to the floor. But a servo is deadbeat over 32 ms, and seldom reaches that limit. A
-servo reaches its speed in one step, while wheels get two thirds of the way. A blocked servo pushes
-with m v / dt = 0.6 N, while blocked wheels push with 1.0 N. A blocked planar robot also turns
-freely, while two slipping wheels hardly turn. Policies that push objects therefore perform worse on
-the wheeled body (docs/robot.md).
+The planar body trains five times faster than the wheeled body. Servo forces are limited to the
+friction that wheels can pass to the floor. But a servo is deadbeat over one step of 32 ms, and
+seldom reaches that limit. The two bodies therefore differ in three ways. The planar body reaches
+its set speed in one step, while the wheeled body gets two thirds of the way. A blocked planar body
+pushes with m v / dt = 0.6 N, while a blocked wheeled body pushes with 1.0 N. A blocked planar body
+also turns freely, while a blocked body on two slipping wheels hardly turns. Policies that push
+objects, if trained on the planar body, therefore perform worse on the wheeled body (docs/robot.md).
 """
 
 import itertools
@@ -30,8 +31,9 @@ class _Numbers(NamedTuple):
     """Gains and limits of the three servos: [3], or [R, 3] if robots differ.
 
     Attributes:
-      gain: N s/m, N s/m, N m s/rad.
-      limit: largest force, N, N, N m.
+      gain: gains of the forward, lateral and turn servo: N s/m, N s/m, N m s/rad.
+      limit: largest forces of the forward and lateral servo, N, and largest torque of the turn
+        servo, N m.
     """
 
     gain: Array
@@ -43,7 +45,8 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     body = spec.worldbody.add_body(name=name)
     body.explicitinertial = True
     body.mass = robot.mass
-    # The robot never turns about x and y, but MuJoCo requires the triangle inequality of moments.
+    # The robot never turns about x and y, but MuJoCo requires three moments of inertia that fulfil
+    # the triangle inequality.
     body.inertia = [robot.yaw_inertia] * 3
     slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     body.add_joint(name=f"{name}_x", type=slide, axis=[1, 0, 0])
@@ -72,10 +75,11 @@ def _add_servos(spec: mujoco.MjSpec, names: list[str], robot: RobotConfig, times
 def _servos(robot: RobotConfig, timestep: float) -> _Numbers:
     """Returns the servos of a nominal robot.
 
-    A deadbeat gain, mass / timestep, is multiplied by the share of a change that a first-order lag
-    makes in one step. At every step, the velocity then equals that of the lag, for any step length.
-    The force limits are those that wheels can pass to the floor (Coulomb): mu m g along either
-    axis, and a torque of mu m g times half the track.
+    The gain is that of a deadbeat servo, mass / timestep (for turns, inertia / timestep),
+    multiplied by `servo_share`. At every step, the velocity then equals that of a first-order lag,
+    for any step length. The lateral servo has no lag. The limits are the Coulomb friction that
+    wheels can pass to the floor: mu m g along either axis, and a torque of mu m g times half the
+    track.
     """
     grip = robot.friction * robot.mass * epuck.GRAVITY
     share = servo_share(robot.motor_lag, timestep)
@@ -89,7 +93,7 @@ def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
     A servo stays deadbeat for another mass. The grip depends on mass, friction and track.
     """
     mass = _ratio(chassis.mass, robot.mass)
-    # Start in float64, which MuJoCo C uses; the drawn factors are float32.
+    # Start with float64 numbers, which MuJoCo C uses; the values of a chassis are float32.
     grip = np.ones((1, 1)) * mass * _ratio(chassis.friction, robot.friction)
     if chassis.track is None:
         return _Numbers(mass, grip)
@@ -99,7 +103,7 @@ def _ratios(chassis: Chassis, robot: RobotConfig, xp: Any) -> _Numbers:
 
 
 def _ratio(drawn: Array | None, nominal: float) -> Array:
-    """Returns ratios [R, 1] of drawn values [R] to the nominal value; [1, 1] if none are drawn."""
+    """Returns the ratios [R, 1] of a chassis' values [R] to the nominal value; [[1]] for None."""
     return np.ones((1, 1)) if drawn is None else drawn[:, None] / nominal
 
 
@@ -114,8 +118,9 @@ def _force(
 ) -> Array:
     """Returns the servos' forces along x and y of the world, and torques about z.
 
-    This replicates the actuators of `_add_servos` (MuJoCo, Computation: actuation model): gain *
-    (set point - velocity in the robot's frame), clamped, and rotated to the world by the heading.
+    The forces equal those of the actuators of `_add_servos` (MuJoCo, Computation: actuation model):
+    gain * (set point - velocity in the robot's frame), clamped, and rotated from the robot's frame
+    to the world frame.
     """
     numbers, ratios = _servos(robot, timestep), _ratios(chassis, robot, xp)
     gain, limit = numbers.gain * ratios.gain, numbers.limit * ratios.limit
@@ -133,10 +138,11 @@ def _turn(vector: Array, cos: Array, sin: Array, xp: Any) -> Array:
 
 
 def servo_share(lag: float, timestep: float) -> float:
-    """Returns the share of a change that a first-order servo makes in one physics step.
+    """Returns the share of a change of its set point that a servo follows in one physics step.
 
     Args:
-      lag: time constant, s; with 0, the servo reaches the set point in one step.
+      lag: time constant of the servo's first-order lag, s; with 0, the servo reaches the set point
+        in one step.
       timestep: s.
 
     Returns:
@@ -162,7 +168,7 @@ def _pose(qpos: Array, xp: Any) -> Array:
 
 
 def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array:
-    """Returns the velocity of a body that rolls on these wheels without slip."""
+    """Returns set points: the velocity of a body that rolls without slip at these wheel speeds."""
     radius = robot.wheel_radius if chassis.wheel_radius is None else chassis.wheel_radius
     track = robot.grip_track if chassis.track is None else chassis.track
     velocity = body_velocity(wheels, radius, track, xp)
@@ -171,7 +177,7 @@ def _ctrl(wheels: Array, chassis: Chassis, robot: RobotConfig, xp: Any) -> Array
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Changes mass and inertia, and the servos if they are actuators."""
+    """Returns changes of mass and inertia, and changes of the servos if they are actuators."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
@@ -188,8 +194,9 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 PLANAR = Body(
     gravity=False,
-    # With this cone, a hull's push and its friction are two separate forces, and contacts are as
-    # soft as without friction. Planar friction has only two cone edges, so it is exactly Coulomb's.
+    # With this cone, a hull's push and its friction are two separate forces, and a contact is as
+    # soft as a contact without friction. In the plane, friction acts along one line only, so the
+    # cone has two edges, and the friction is exactly Coulomb's.
     cone=mujoco.mjtCone.mjCONE_ELLIPTIC,
     add=_add,
     qpos=_qpos,

@@ -14,10 +14,11 @@ from swarmjax.sim.config import (
     MOST_FRICTION,
 )
 
-_LONGEST = 3600.0  # s; a training episode takes 16 s, and no pause in it may be longer
+_LONGEST = 3600.0  # s; far more than is useful, since a training episode takes 16 s
 _MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
 _LATENCY_REASON = "every arena stores one command or observation for each control step of latency"
-# Factors on counts, which have no meaning for sensors that report metres.
+# Settings that act on a sensor's counts. They have no meaning for `ideal` sensors, which report
+# metres.
 COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot")
 
 
@@ -25,9 +26,9 @@ COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot"
 class RealismConfig(Section):
     """Settings of the sensor models, and of differences between robots and between steps.
 
-    A range is (low, high) of a uniform distribution. A factor that is null is off; this does not
-    affect the others. configs/realism/real.yaml holds the numbers of a real robot, with their
-    sources.
+    A pair of numbers is the range (low, high) of a uniform distribution. A setting that is null
+    switches off its own effect only. configs/realism/real.yaml holds the numbers of a real robot,
+    with their sources.
     """
 
     name: Literal["ideal", "webots", "real"] = setting(

@@ -1,13 +1,14 @@
-"""Infrared sensor models: convert ray lengths to counts, and back.
+"""Infrared sensor models, which convert ray lengths to counts and counts to ray lengths.
 
-A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. The real
-ray rises by `robot.sensor_tilt`, so it is longer by 1 / cos(tilt) against an upright face.
+A ray is the horizontal distance from the sensor's origin to the nearest object, in metres. A
+robot's ray is tilted upwards by `robot.sensor_tilt`, so its length to an upright face is this
+distance divided by cos(tilt).
 
-`webots` is a lookup table; the default is that of Webots' E-puck. The table maps (length of the
-ray) / reflectance to counts, with multiplicative noise. In free space, the e-puck reads 67.19
-counts. `real` is a curve fitted to each sensor of a measured robot. The curve gives reflectance * A
-/ (gap + d)^2 counts above free space, with additive noise. Readings in free space are set to zero,
-as by the firmware. The code runs on NumPy or JAX.
+`webots` is a lookup table; the default is the table of Webots' E-puck. It maps (length of the ray)
+/ reflectance to counts, with multiplicative noise. With the default table, a sensor that sees
+nothing (free space) reads 67.19 counts. `real` has a curve for each sensor, fitted to a measured
+robot. The curve gives reflectance * A / (gap + d)^2 counts, with additive noise; the counts in free
+space are subtracted, as in the firmware. The code runs on NumPy or JAX.
 """
 
 import math
@@ -23,13 +24,13 @@ Response = Literal["webots", "real"]
 
 
 class Table(NamedTuple):
-    """The response of sensors.
+    """The lookup table of a `webots` sensor.
 
     Attributes:
-      length: lengths of the ray, rising, m.
-      counts: value at each length, falling.
-      share: standard deviation at each length, relative to the value.
-      rise: horizontal part of a ray's length.
+      length: increasing ray lengths along the tilted ray, m.
+      counts: counts at each length, decreasing.
+      share: standard deviation of the noise at each length, relative to the counts.
+      rise: ratio of a ray's horizontal length to its length, the cosine of the tilt.
     """
 
     length: tuple[float, ...]
@@ -50,9 +51,10 @@ def table(points: Sequence[Sequence[float]], tilt: float) -> Table:
 
 
 EPUCK = table(epuck.INFRARED_TABLE, epuck.SENSOR_TILT)
-# m; nothing is seen beyond this length, so rays end there. Webots' table ends at this length, for
-# objects of reflectance 1 at most. The measured curve would still read 13 to 22 counts there. The
-# longest range in any e-puck simulator is 0.10 to 0.12 m (ARGoS, Enki).
+# m; horizontal length at which rays end, because sensors see nothing beyond it. For `webots`, this
+# is where the table ends; reflectances below 1 only shorten the range. For `real`, the fitted curve
+# would still give 13 to 22 counts at this length. The longest ranges in e-puck simulators are 0.10
+# to 0.12 m (ARGoS, Enki).
 REACH = {"webots": EPUCK.reach, "real": 0.10}
 _STRENGTH, _DEPTH, _FREE, _SD, _SATURATION = np.array(epuck.INFRARED_FIT, np.float32).T
 _SPAN = _SATURATION - _FREE
@@ -70,10 +72,10 @@ TO_HULL = _distance_to_hull()
 
 
 class Wear(NamedTuple):
-    """How each sensor differs from a nominal one, in arrays [..., R, K]; None for no difference.
+    """How each sensor differs from a nominal sensor, in arrays [..., R, K]; None for no difference.
 
     Attributes:
-      noise: factor on the model's own noise; None for no noise at all.
+      noise: factor on the sensor model's own noise; None for no noise at all.
       gain: factor on the reflected part of the reading.
       dead: whether the sensor never detects anything, bool.
     """
@@ -97,14 +99,14 @@ def read(
     Args:
       response: sensor model.
       ray: [..., R, K] horizontal distance from the sensor's origin to the nearest object, m.
-      reflectance: [..., R, K] reflectance of that object, above 0 and at most 1; None is 1.
-      wear: wear of the sensors.
-      normal: [..., R, K] standard normal, drawn for each sample; None for no noise.
+      reflectance: [..., R, K] reflectance of that object, above 0 and at most 1; None if all are 1.
+      wear: how each sensor differs from a nominal sensor.
+      normal: [..., R, K] standard normal numbers, newly drawn for each sample; None for no noise.
       xp: `numpy` or `jax.numpy`.
       table: the response `webots`.
 
     Returns:
-      [..., R, K] counts, not clamped: noise can take a `real` reading below 0.
+      [..., R, K] counts. They are not clamped: noise can make a `real` reading negative.
     """
     if wear.dead is not None:
         ray = xp.where(wear.dead, xp.inf, ray)
@@ -125,7 +127,7 @@ def expected(response: Response, ray: Array, xp: Any, table: Table = EPUCK) -> A
 
 
 def distance(response: Response, counts: Array, xp: Any, table: Table = EPUCK) -> Array:
-    """Returns the ray that a nominal sensor's counts correspond to: the inverse of `expected`.
+    """Returns the ray length that corresponds to a nominal sensor's counts: inverts `expected`.
 
     Args:
       response: sensor model.
@@ -134,19 +136,21 @@ def distance(response: Response, counts: Array, xp: Any, table: Table = EPUCK) -
       table: the response `webots`.
 
     Returns:
-      [..., R, K] m, falling as counts rise, from 0 to the reach of the response. A saturated
-      `real` sensor gives the largest distance at which it saturates.
+      [..., R, K] horizontal ray lengths, m, from 0 to the reach of the sensor model; the more
+      counts, the shorter. For the counts of a saturated `real` sensor, the result is the largest
+      distance at which the sensor saturates.
     """
     if response == "webots":
         length = _interpolate(counts, table.counts[::-1], table.length[::-1], xp)
         return xp.clip(table.rise * length, 0.0, table.reach)
-    # Any lower limit works if it is below the reading at the largest distance.
+    # The lower limit of 1 avoids a division by 0. Any value below the reading at the largest
+    # distance gives the same result.
     echo = xp.clip(counts, 1.0, _SPAN)
     return xp.clip(xp.sqrt(_STRENGTH / echo) - _DEPTH + TO_HULL, 0.0, REACH[response])
 
 
 def _webots(ray: Array, bright: Array, gain: Array, table: Table, xp: Any) -> tuple[Array, Array]:
-    """Returns counts and their standard deviation, from a table.
+    """Returns counts and their standard deviation, from the lookup table of `webots`.
 
     Webots divides the length by the reflectance before the lookup, and multiplies the counts by
     1 + share * normal (DistanceSensor, section "Sensor noise").
@@ -158,17 +162,17 @@ def _webots(ray: Array, bright: Array, gain: Array, table: Table, xp: Any) -> tu
 
 
 def _real(ray: Array, bright: Array, gain: Array, xp: Any) -> tuple[Array, Array]:
-    """Returns counts above free space and their standard deviation, from the fitted curve."""
+    """Returns counts above free space and their standard deviation, from the curve of `real`."""
     gap = xp.maximum(ray - TO_HULL, 0.0)
     echo = bright * gain * _STRENGTH / (gap + _DEPTH) ** 2
     return xp.where(ray < REACH["real"], xp.minimum(echo, _SPAN), 0.0), _SD
 
 
 def _interpolate(x: Array, knots: Sequence[float], values: Sequence[float], xp: Any) -> Array:
-    """Interpolates linearly between increasing knots, and holds the end values outside them.
+    """Interpolates linearly between increasing knots; outside the knots, the end values hold.
 
     The result is a sum of one ramp per segment. On an accelerator, this is cheaper than a search.
-    The result is exact where the last value is small, since the sum starts from there.
+    The sum starts from the last value, so the result has no rounding error beyond the last knot.
     """
     result = values[-1]
     for i, start in enumerate(knots[:-1]):

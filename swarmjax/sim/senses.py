@@ -1,4 +1,4 @@
-"""What surrounds each robot of a swarm: what its infrared sensors see, and how near its hull is."""
+"""Finds what surrounds each robot: what its sensors see, and the gaps from its hull to objects."""
 
 from typing import Any, NamedTuple
 
@@ -17,8 +17,10 @@ class Scene(NamedTuple):
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away from each other.
       side: [] side of the arena, m.
-      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m); absent ones are parked far away.
-      turn: [R, K] by how much each sensor is turned to the left, rad; None: 0.
+      obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m); absent obstacles are parked far
+        away.
+      turn: [R, K] angle by which each sensor is turned to the left of its nominal yaw, rad; None if
+        all are 0.
       shades: reflectances of surfaces; None if all are 1.
     """
 
@@ -35,8 +37,9 @@ class Surround(NamedTuple):
     Attributes:
       ray: [R, K] ray lengths, m; see `infrared.distances`.
       bright: [R, K] reflectances of what the rays meet; None if all are 1.
-      gap: [R, 3] gaps, m; exact up to the sensors' range, see `gaps.gaps`.
-      complete: [] whether no robot was left out; bool.
+      gap: [R, 3] gaps from the hull to the nearest object of each kind, m; exact up to the sensors'
+        range, see `gaps.gaps`.
+      complete: [] bool; False if some robots near another may have been left out.
     """
 
     ray: Array
@@ -72,7 +75,7 @@ def look(scene: Scene, poses: Any, hull_radius: float, limit: float, impl: str =
         ray, bright = infrared.distances(*arena, jnp, mount, near), None
     else:
         ray, bright = infrared.sights(*arena, shades, mount, near)
-    # Several consumers read these. Without the barrier, XLA recomputes the rays for each consumer
-    # on a GPU.
+    # Several computations use the rays. Without the barrier, XLA on a GPU recomputes the rays for
+    # each of them.
     ray, bright = jax.lax.optimization_barrier((ray, bright))
     return Surround(ray, bright, gap, jnp.asarray(True) if near is None else ~near.full)

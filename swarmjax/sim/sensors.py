@@ -1,4 +1,4 @@
-"""Checks the infrared sensors of a robot: where they sit, how far they see, what they read."""
+"""Checks settings of the infrared sensors: their poses, their range and their response."""
 
 import itertools
 import math
@@ -7,14 +7,14 @@ from swarmjax.config import ConfigError, show
 
 Pose = tuple[float, float, float]  # x (m), y (m), yaw (rad)
 Point = tuple[float, float, float]  # ray length (m), value, relative deviation
-MOST = 32  # sensors of a robot; a lidar needs other code
-MOST_YAW = 6.2832  # rad; a whole turn
-MOST_VALUE = 1e6  # counts; converters have 24 bits at most
-_ROUNDING = 1e-9  # m; a sensor may sit on the hull's surface
+MOST = 32  # most sensors of a robot; a lidar, with more rays, needs other code
+MOST_YAW = 6.2832  # rad; a full turn
+MOST_VALUE = 1e6  # largest counts of a sensor
+_ROUNDING = 1e-9  # m; rounding error allowed, as a sensor may sit exactly on the hull's surface
 
 
 def way_to_hull(pose: Pose, hull_radius: float) -> float:
-    """Returns how far a ray runs within its own hull, m.
+    """Returns the length of a ray, in m, from its sensor to the surface of its own robot's hull.
 
     Args:
       pose: place and direction of the sensor.
@@ -35,7 +35,8 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
       reach: range of the sensors, m.
 
     Raises:
-      ConfigError: a sensor is impossible.
+      ConfigError: there are too few or too many sensors, a sensor lies outside the hull, a yaw is
+        too large, or a ray ends within its own hull.
     """
     if not 1 <= len(poses) <= MOST:
         raise ConfigError(f"sensor_poses has {len(poses)} sensors: give 1 to {MOST}.")
@@ -62,13 +63,14 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
 
 
 def check_response(points: tuple[Point, ...]) -> None:
-    """Refuses a table that cannot be read in both directions.
+    """Refuses a table that does not assign one value to each length and one length to each value.
 
     Args:
-      points: ray length, value and relative deviation, nearest first.
+      points: rows of ray length (m), value and relative deviation; the shortest length comes first.
 
     Raises:
-      ConfigError: lengths do not rise, or values do not fall.
+      ConfigError: there are fewer than two rows, lengths do not increase, or values do not
+        decrease.
     """
     pairs = itertools.pairwise(points)
     if len(points) < 2 or any(a[0] >= b[0] or a[1] <= b[1] for a, b in pairs):

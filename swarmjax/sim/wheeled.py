@@ -1,16 +1,17 @@
-"""The wheeled body: a whole robot, free in space, on two driven wheels and two skids.
+"""The wheeled body: a free body in space that stands on two driven wheels and two skids.
 
-The motors are steppers behind a 50:1 gear. A command sets the speed of a wheel, and no load changes
-it until steps are lost. (Webots gives its motors 10 N m, which has the same effect.) Here the motor
-is a velocity servo on a large reflected inertia, deadbeat in one physics step. The floor passes a
-torque of mu m g r / 2 = 0.016 N m to each wheel. Over 16 ms, this torque changes the wheel's speed
-by 0.2 % of the speed limit, and the next step undoes the change. A motor with only the wheel's
-inertia (1e-6 kg m^2) does not work. With a stable gain, it would lag by several milliseconds, and
-the lag would depend on the time step.
+The e-puck's motors are stepper motors with a 50:1 gear. A command sets the speed of a wheel, and a
+load does not change this speed unless it is so large that the motor loses steps. (Webots gives its
+motors 10 N m, which has the same effect.) Here a motor is a velocity servo on a wheel with a large
+reflected inertia, and the servo is deadbeat in one physics step. The floor's friction exerts a
+torque of at most mu m g r / 2 = 0.016 N m on each wheel. Over 16 ms, this torque changes the
+wheel's speed by 0.2 % of the speed limit, and the next step undoes the change. A servo on the
+wheel's own inertia alone (1e-6 kg m^2) would not work: with a stable gain, it would lag by several
+milliseconds, and the lag would depend on the time step.
 
-The grip of wheels on the floor is a contact. Within one physics step, this contact removes half the
-penetration. It also removes all slip, as far as friction allows. MuJoCo's default contact takes 10
-to 30 ms for this, depending on the time step, and the wheel creeps meanwhile.
+Wheels grip the floor through a contact. Within one physics step, this contact removes half the
+penetration, and all slip as far as friction allows. MuJoCo's default contact would take 10 to 30 ms
+for this, depending on the time step, and wheels would creep meanwhile.
 """
 
 from typing import Any
@@ -27,14 +28,14 @@ from swarmjax.sim.planar import servo_share
 Array = Any
 FLOOR = "floor"
 ROTOR_INERTIA = 0.02  # kg m^2, reflected through the gear; chosen as explained above
-SKID_RADIUS = 0.005  # m; half the height of the box under the Webots e-puck
+SKID_RADIUS = 0.005  # m; half the height of the box that carries the Webots e-puck
 _QPOS = 9  # x, y, z, quaternion (w, x, y, z), left wheel, right wheel
 REST_DEPTH = 1e-5  # m; depth of the wheels in the floor at rest; 9e-6 with steps of 16 ms
 _PENETRATION = 0.5  # share of the penetration that one physics step removes
-_IMPEDANCE = 0.999  # impedance of the grip; the grip cancels all but a thousandth of gravity
-# m; from the middle of a tyre to the wheel's frame. The e-puck's tyre is 5 mm wide, so its geom
-# lies off this frame. If a geom is compiled at the origin of its body's frame, MuJoCo treats it as
-# fixed there; `geom_pos` does not move it.
+_IMPEDANCE = 0.999  # impedance of the grip, which cancels all but a thousandth of gravity
+# m; from the middle of a tyre to the origin of the wheel's frame, half the tyre's width of 5 mm.
+# The wheel's geom must not lie at this origin: MuJoCo treats a geom that is compiled at the origin
+# of its body's frame as fixed there, so `geom_pos` could not move it.
 _TO_INNER_EDGE = 0.0025
 _SIDES = np.array([1.0, -1.0], np.float32)  # left, right
 
@@ -52,14 +53,14 @@ def _add(spec: mujoco.MjSpec, name: str, robot: RobotConfig, timestep: float) ->
     for label, x in (("front", skid_x), ("back", -skid_x)):
         place = [x, 0.0, SKID_RADIUS + epuck.SKID_CLEARANCE]
         skid = add_geom(body, f"{name}_{label}", sphere, [SKID_RADIUS, 0, 0], place, FLOOR_GROUP)
-        # With condim 1, skids carry weight but do not brake, as is intended for the smooth box of
-        # Webots.
+        # With condim 1, skids carry weight but do not brake, like the smooth box under the Webots
+        # e-puck.
         spec.add_pair(geomname1=FLOOR, geomname2=skid, condim=1, **_grip(timestep))
     return add_hull(body, name, robot.hull_radius)
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
-    """Adds the floor together with the first robot."""
+    """Adds the floor, unless an earlier robot has already added it."""
     if spec.geom(FLOOR) is None:
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         add_geom(spec.worldbody, FLOOR, plane, [0, 0, 1], [0, 0, 0], FLOOR_GROUP)
@@ -86,8 +87,8 @@ def _add_wheel(
     """Adds a wheel, its motor, and its grip on the floor; `side` is 1 for left and -1 for right.
 
     The wheel's geom is a sphere, centred on the axle above the tyre's contact point. The sphere
-    rolls like a wheel of the same radius. The distance between the contact points of both wheels is
-    constant.
+    rolls like a wheel of the same radius, and the distance between the contact points of the two
+    wheels stays constant.
     """
     inner_edge = _inner_edge(robot)
     wheel = body.add_body(name=name, pos=[0.0, side * inner_edge, robot.wheel_radius])
@@ -149,14 +150,14 @@ def encoders(qpos: Array, xp: Any) -> Array:
 
     Returns:
       [..., R, 2] angles of the left and right wheel since the start, rad, rounded down to whole
-      steps of 0.00628 (Webots E-puck, 1000 steps per turn).
+      steps of 0.00628 rad (Webots E-puck, 1000 steps per turn).
     """
     angle = qpos.reshape(*qpos.shape[:-1], -1, _QPOS)[..., 7:]
     return xp.floor(angle / epuck.ENCODER_STEP) * epuck.ENCODER_STEP
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Returns the changes. Wheels of another size move their axle, so that the skids stay clear."""
+    """Returns the changes. Larger wheels raise the axle in the body, so skids stay clear."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)
@@ -174,8 +175,9 @@ def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjM
 
 WHEELED = Body(
     gravity=True,
-    # This is MuJoCo's default cone. The grip of the wheels was measured with it. A model has only
-    # one cone, and MJX supports no elliptic cone together with skids of condim 1.
+    # The pyramidal cone is MuJoCo's default, and the grip of the wheels was measured with it. All
+    # contacts of a model share one kind of cone, and MJX does not support an elliptic cone together
+    # with the condim 1 of skids.
     cone=mujoco.mjtCone.mjCONE_PYRAMIDAL,
     add=_add,
     qpos=_qpos,

@@ -133,7 +133,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["robots=3"], "robots is not a key: did you mean stage.robots?"),
         (["name=s3"], "name is not a key: did you mean run.dir or stage.name?"),
         (["learning_rate=1"], "learning_rate is not a key: did you mean "
-         "algo.actor_learning_rate?"),
+         "algo.critic_learning_rate?"),
         # Words of other tools.
         *(([f"{word}=1"], f"{word} is not a key: did you mean run.dir?")
           for word in ("out", "dir", "output", "folder", "logdir", "save")),
@@ -166,8 +166,8 @@ def test_import_needs_neither_jax_nor_hydra():
         (["stage=[s1,s2]"], "stage is '[s1,s2]': give stage=curriculum "
          f"'stage.sequence=[s1,s2]' for several stages, or one of {CHOICES}, or the path of a "
          ".yaml file."),
-        (["lr=1e-3"], "lr is not a key: did you mean algo.critic_learning_rate or "
-         "algo.actor_learning_rate?"),
+        (["lr=1e-3"], "lr is not a key: did you mean algo.actor_learning_rate or "
+         "algo.critic_learning_rate?"),
         (["stage=expand"], "stage is 'expand': give expanded (the most similar name) or one of "
          f"{CHOICES}, or the path of a .yaml file."),
         (["stage=../train"], f"stage is '../train': give one of {CHOICES}, or the path of a .yaml "

@@ -1,4 +1,4 @@
-"""Makes kernels in Warp, which compute many arenas, work under `vmap`."""
+"""Makes Warp kernels that compute many arenas at once work under `vmap`."""
 
 import threading
 from functools import partial
@@ -11,16 +11,17 @@ from jax.custom_batching import custom_vmap
 
 # Warp loads a module when JAX first traces one of its kernels. Only one thread at a time may do so.
 _LOADING = threading.Lock()
-# All calls of this process, in order: the function and the shapes of its inputs.
+# All traced calls in this process, in order: for each call, the function and the shapes of its
+# inputs.
 CALLS: list[tuple[Any, tuple]] = []
 
 
 def over_arenas(solve: Any, *inputs: Any) -> Array:
-    """Calls a function of many arenas for one arena; each `vmap` axis becomes more arenas.
+    """Calls a function of many arenas for one arena; under `vmap`, it gets all arenas at once.
 
     Args:
       solve: takes the inputs with a leading arena axis, and returns an array with that axis.
-      *inputs: arrays of one arena, or trees of them.
+      *inputs: arrays of one arena, or pytrees of such arrays.
 
     Returns:
       The result for the arena.
@@ -48,9 +49,14 @@ def _call(solve: Any, *given: Any) -> Array:
 
 
 def repeat(calls: list[tuple[Any, tuple]]) -> None:
-    """Tells Warp of calls in a program that is not traced now, but was after the same `CALLS`.
+    """Registers with Warp the calls of a program that was compiled in an earlier process.
 
-    A traced program names each of its calls by a number, which Warp counts.
+    Such a program is not traced again. It refers to each Warp call by a number. Warp numbers calls
+    in the order in which they are registered, so `CALLS` must be as it was when the program was
+    traced.
+
+    Args:
+      calls: the entries that tracing the program added to `CALLS`.
     """
     for solve, shapes in calls:
         jax.eval_shape(partial(_call, solve), *shapes)

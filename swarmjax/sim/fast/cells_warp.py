@@ -1,8 +1,9 @@
-"""A grid of cells in Warp, which finds the robots near a place without looking at all robots.
+"""Puts robots into a grid of cells, in Warp, to find those near a place without checking all.
 
-A robot is in the cell of its centre. The robots of a cell form a chain of any length, so no cell
-overflows. The grid repeats: after its last cell along x or y its first one follows. It thus has a
-cell for every place in the plane, also for parked robots and for those outside the walls.
+A robot is in the cell of its centre. The robots of a cell form a linked list of any length, so no
+cell overflows. The grid repeats: along x and y, the last cell is followed by the first cell. So the
+grid has a cell for every place in the plane, also for parked robots and for robots outside the
+walls.
 """
 
 import math
@@ -11,10 +12,10 @@ import jax.numpy as jnp
 import warp as wp
 from jax import Array
 
-# Cells; all places further away from the origin are in the same row or column of cells. Up to here
-# float32 rounds to less than 1 % of a cell.
+# Distance from the origin, in cells. Along each axis, all places beyond this distance share one
+# cell. Up to this distance, float32 rounds to less than 1 % of a cell.
 _FAR = wp.constant(32768.0)
-_PER_ROBOT = 2.0  # least number of cells along each axis, per root of the number of robots
+_PER_ROBOT = 2.0  # each axis has at least this many cells times the square root of the robots
 
 
 def chain(place: Array, width: float) -> tuple[Array, Array]:
@@ -26,7 +27,8 @@ def chain(place: Array, width: float) -> tuple[Array, Array]:
 
     Returns:
       [A, C, C] the first robot of each cell, and [A, R] the robot that follows each robot in its
-      cell; -1 for none. C is a power of two. The order in a cell may differ from run to run.
+      cell; -1 for none. C is a power of two. The order of the robots in a cell may differ from run
+      to run.
     """
     arenas, robots = place.shape[:2]
     across = 2 ** math.ceil(math.log2(_PER_ROBOT * math.sqrt(robots)))
@@ -40,7 +42,7 @@ def chain(place: Array, width: float) -> tuple[Array, Array]:
 def _enter(
     place: wp.array2d[wp.vec3], width: float, first: wp.array3d[int], after: wp.array2d[int]
 ) -> None:
-    """Puts a robot into its cell, before the robots that are there."""
+    """Puts a robot into its cell, at the head of the list of the robots already there."""
     i, robot = wp.tid()
     here, last = place[i, robot], first.shape[1] - 1
     x, y = cell_at(here[0], width) & last, cell_at(here[1], width) & last
@@ -49,16 +51,16 @@ def _enter(
 
 @wp.func
 def cell_at(x: float, width: float) -> int:
-    """Returns the cell along an axis, before the grid repeats; NaN has a cell, too."""
+    """Returns the index of x's cell in an endless row of cells; NaN has a cell, too."""
     across = x / width
     return int(wp.floor(wp.where(across > -_FAR, wp.min(across, _FAR), -_FAR)))
 
 
 @wp.func
 def cells_around(x: float, reach: float, width: float, across: int) -> wp.vec2i:
-    """Returns the first cell within reach along an axis, and the end of them.
+    """Returns the cells within reach of x along an axis: the first, and one past the last.
 
-    They are no more than the grid has (`across`), or a robot would be found twice.
+    There are at most as many as the grid has (`across`); otherwise a robot would be found twice.
     """
     first = cell_at(x - reach, width)
     return wp.vec2i(first, wp.min(cell_at(x + reach, width) + 1, first + across))

@@ -1,16 +1,18 @@
-"""The contacts of planar robots in Warp, and the kernels around a solver of their forces.
+"""Kernels in Warp that list the contacts of planar robots and call a solver for their forces.
 
-The threads of an arena list its contacts, and solve for the forces (`planar_warp`, and
-`rubbing_warp` with friction). In a kernel that XLA unrolls over all possible
-contacts, most of the work would go to contacts that do not exist.
+The threads of an arena list its contacts, and solve for the contact forces (with `planar_warp`, or
+with `rubbing_warp` if there is friction). A kernel made by XLA would compute all possible contacts,
+most of which do not exist.
 
 Robots that touch each other, directly or through others, form an island. A force in one island
-changes nothing in another, so each thread solves islands of its own. The fewer arenas there are,
-the more threads each has, up to the 32 of a CUDA warp. On a CPU it has one.
+changes nothing in another island, so each thread solves whole islands by itself. The fewer arenas
+there are, the more threads each arena has, up to the 32 threads of a CUDA warp. On a CPU, each
+arena has one thread.
 
-Comparing all pairs of many robots would take too long. For more than `MANY` robots, one thread per
-obstacle, wall and robot lists the contacts with robots in the cells around it (`cells_warp`), in
-the same order. The threads of the arena then only solve for the forces.
+Comparing all pairs of many robots would take too long. With more than `MANY` robots, a first kernel
+therefore lists the contacts: one thread for each obstacle, wall and robot looks for robots in the
+cells around it (`cells_warp`). The list has the same order. The threads of the arena then only
+solve for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
@@ -36,22 +38,22 @@ from swarmjax.sim.fast.arenas_warp import over_arenas
 from swarmjax.sim.fast.discs import DiscRobots, Discs
 from swarmjax.sim.fast.gaps_warp import WarpArena
 
-MANY = 100  # robots; on two cores, cells take less time beyond about this number
+MANY = 100  # robots; on two cores, cells save time beyond about this number
 _BLOCK = 64  # threads per block; with few arenas, blocks of 256 would leave most of a GPU idle
-_THREADS = 2**17  # threads of all arenas, beyond which more threads an arena do not help
+_THREADS = 2**17  # threads of all arenas together; more do not help
 _MOST_THREADS = 32
 
 
 def launch(solver: str, discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -> Array:
     """Computes the accelerations of one arena's robots, including contacts.
 
-    `vmap` adds arenas to the same kernel, for any axes.
+    Under `vmap`, over any number of axes, one kernel computes all arenas.
 
     Args:
-      solver: name of a module with `KERNELS`, the result of `kernels_of`, and `ROWS`, the rows of
-        `WarpArena.contact` that they use.
+      solver: name of a module with the constants `KERNELS`, a result of `kernels_of`, and `ROWS`,
+        the number of rows of `WarpArena.contact` that these kernels use.
       discs: constants.
-      robots: their state, and their accelerations without contacts.
+      robots: the state of the robots, and their accelerations without contacts.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -85,7 +87,7 @@ def _launch(solver: str, discs: Discs, robots: DiscRobots, side: Array, obstacle
     )
     given = motion, numbers, jnp.minimum(listed, contacts), contact
     total = call(many, in_out_argnames=["contact"])(*given, output_dims=shapes, **dims)[1]
-    # An arena with more contacts than it has room for is broken.
+    # An arena with more contacts than there is memory for gets NaN, so it counts as broken.
     return jnp.where((listed > contacts)[:, None, None], jnp.nan, total)
 
 
@@ -97,14 +99,16 @@ def _threads_each(arenas: int) -> int:
 
 
 def kernels_of(solve: Any) -> Any:
-    """Makes two kernels that compute the accelerations of arenas.
+    """Makes two kernels that compute the accelerations of the robots in many arenas.
 
     Args:
-      solve: a Warp function that takes a `WarpArena`, whose `total` is `free`, and the first of the
-        contacts to solve, and sets `total` of their robots.
+      solve: a Warp function that takes a `WarpArena` and the first of the contacts to solve. At the
+        call, `total` of the arena equals `free`. The function sets `total` of the robots in these
+        contacts.
 
     Returns:
-      The kernels, for `launch`: one lists the contacts, the other takes them from a list.
+      Two kernels for `launch`: the first one lists the contacts itself, the second one gets a list
+      of contacts.
     """
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -174,7 +178,7 @@ def _arena_of(
 
 @wp.func
 def let_go(arena: WarpArena, first: int) -> None:
-    """Sets the accelerations of a thread's robots to their values without contacts."""
+    """Resets the accelerations of the robots in a thread's contacts to those without contacts."""
     k = wp.int32(first)
     while k >= 0:
         sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
@@ -186,9 +190,9 @@ def let_go(arena: WarpArena, first: int) -> None:
 
 @wp.func
 def _deal_out(arena: WarpArena, count: int, thread: int) -> int:
-    """Gives the islands to the threads; returns the first contact of this thread, or -1.
+    """Distributes the islands among the threads; returns this thread's first contact, or -1.
 
-    Also sets the accelerations to their values without contacts.
+    Also sets all accelerations to their values without contacts.
     """
     for i in range(thread, arena.free.shape[0], arena.threads):
         arena.total[i] = arena.free[i]
@@ -208,7 +212,7 @@ def _deal_out(arena: WarpArena, count: int, thread: int) -> int:
 
 @wp.func
 def _join(arena: WarpArena, count: int, thread: int) -> bool:
-    """Gives robots that touch the first of both islands; returns whether any had two."""
+    """Joins the islands of touching robots; returns whether any robots had different islands."""
     moves = wp.bool(False)
     for k in range(thread, count, arena.threads):
         sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
@@ -223,7 +227,7 @@ def _join(arena: WarpArena, count: int, thread: int) -> bool:
 
 @wp.func
 def body_of(arena: WarpArena, sides: wp.vec2i) -> wp.vec3:
-    """Returns the sum of `body` over both robots of a contact."""
+    """Returns the sum of `arena.body` over the one or two robots of a contact."""
     total = arena.body[sides[0]]
     if sides[1] >= 0:
         total = total + arena.body[sides[1]]
@@ -232,7 +236,7 @@ def body_of(arena: WarpArena, sides: wp.vec2i) -> wp.vec3:
 
 @wp.func
 def impedance_at(numbers: wp.array[float], depth: float) -> float:
-    """Returns the impedance at a depth, m: MuJoCo, "Solver parameters", d(r) of `solimp`."""
+    """Returns the impedance at a depth (m): d(r) in MuJoCo's documentation, "Solver parameters"."""
     least, most, middle, power = numbers[3], numbers[4], numbers[6], numbers[7]
     share = wp.min(depth / numbers[5], 1.0)
     rise = wp.pow(share, power) / wp.pow(middle, power - 1.0)
@@ -243,5 +247,5 @@ def impedance_at(numbers: wp.array[float], depth: float) -> float:
 
 @wp.func
 def give_at(weight: float, impedance: float) -> float:
-    """Returns the softness R, 1 / kg: MuJoCo, "Solver parameters"."""
+    """Returns the softness R (1 / kg) in MuJoCo's documentation, "Solver parameters"."""
     return wp.max(weight * (1.0 - impedance) / impedance, 1.0e-15)  # mjMINVAL

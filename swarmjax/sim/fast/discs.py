@@ -1,10 +1,11 @@
-"""Planar robots as discs: a physics step without bodies in space.
+"""Steps the physics of planar robots as discs in the plane.
 
-A hull is a sphere between upright faces, so in the plane it is a disc. Its contacts (condim 1) push
-through its centre, so they move it along x and y and never turn it. MJX's own step builds every
-contact in space. At every iteration of Newton's method, it factorises one matrix for all robots.
-Together, these two tasks take nine tenths of the step's time. The contact forces are the solution
-of MuJoCo's convex problem in its dual form (MuJoCo's documentation, Computation, "Dual problem"),
+A hull is a sphere between upright faces, so in the plane it is a disc. Contacts without friction
+(condim 1) push through its centre, so they move it along x and y and never turn it. MJX's own step
+does more: it builds every contact in three dimensions, and at every iteration of Newton's method it
+factorises one matrix for all robots. These two tasks take nine tenths of that step's time. The
+contact forces are the solution of MuJoCo's convex problem in its dual form (MuJoCo's documentation,
+Computation, "Dual problem"),
 
     minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref).
 
@@ -15,7 +16,8 @@ The dual form has one unknown per contact, and most states have no contact. Proj
 
 where a is the acceleration under the current forces. The problem has a single minimum, so PGS and
 Newton's method reach the same solution. `planar_jax` implements PGS in JAX, `planar_warp` in Warp.
-A sweep goes through the fixtures one by one, for all robots, and then through the pairs of robots.
+A sweep updates each force once: it goes through the fixtures (obstacles and walls) one by one, each
+for all robots, and then through the pairs of robots.
 """
 
 import functools
@@ -37,27 +39,28 @@ from swarmjax.sim.geometry import CONTACT_HEIGHT
 # Sweeps stop when no force changes by more than this share of the largest force. float32 rounds at
 # 1e-7.
 TOLERANCE = 1e-6
-# m; distance of a hull's centre to the nearer of a box's top and bottom. If a centre lies deeper
-# within the box than this, MuJoCo pushes it up or down, where no joint moves.
+# m; vertical distance from a hull's centre to a box's top or bottom, whichever is nearer. If a
+# centre lies deeper than this behind the box's sides, MuJoCo pushes it up or down, and no joint
+# moves in these directions.
 DEEPEST = min(CONTACT_HEIGHT, 2.0 * sim_model.HALF_HEIGHT - CONTACT_HEIGHT)
 
 
 class Discs(NamedTuple):
-    """Constants of a program.
+    """Constants of a compiled program.
 
     Attributes:
       radius: radius of the hulls, m.
       timestep: one physics step, s.
-      sweeps: largest number of sweeps.
+      sweeps: largest number of sweeps in a physics step.
       body: [R] rows of the hulls among the model's bodies.
-      opponent: [N, R] the robot that each robot meets in a round; a robot that meets none has its
-        own index.
+      opponent: [N, R] index of the robot with which each robot forms a pair in each of N rounds
+        (see `_rounds`); its own index if it has no partner in that round.
       solref: time constant (s) and damping ratio of all contacts.
       solimp: impedance of all contacts: smallest, largest, width (m), midpoint, power.
       friction: friction between hulls and everything that they touch; 0 for none.
-      solve: `push_apart` of a solver. It takes these constants, the robots of an arena, its side []
-        (m) and obstacles [M, 5] (x, y, yaw, half edges), and returns the accelerations including
-        contacts.
+      solve: the function `push_apart` of a solver. It takes these constants, the robots of an
+        arena, the arena's side [] (m) and its obstacles [M, 5] (x, y, yaw, half edges). It returns
+        the robots' accelerations including contacts.
     """
 
     radius: float
@@ -73,7 +76,7 @@ class Discs(NamedTuple):
 
 @struct.dataclass
 class Model:
-    """Fields that a step reads from a model, with MuJoCo's names.
+    """The fields of a model that a step reads, with MuJoCo's names.
 
     Attributes:
       body_mass: [B] kg.
@@ -88,13 +91,13 @@ class Model:
 
 @struct.dataclass
 class Data:
-    """Fields that change in an arena, with MuJoCo's names.
+    """The fields of an arena that change in a step, with MuJoCo's names.
 
     Attributes:
       qpos: [Q] x (m), y (m), yaw (rad) of each robot in turn.
-      qvel: [V] velocities of the positions in `qpos`.
-      qacc_warmstart: [V] accelerations of the previous step.
-      qfrc_applied: [V] all forces except contact forces, N, N, N m.
+      qvel: [V] velocities of the robots in the order of `qpos`, m/s, m/s, rad/s.
+      qacc_warmstart: [V] accelerations in the previous step.
+      qfrc_applied: [V] sums of all forces and torques except those of contacts, N, N, N m.
     """
 
     qpos: Array
@@ -108,12 +111,12 @@ class DiscRobots(NamedTuple):
 
     Attributes:
       place: [R, 3] x (m), y (m), yaw (rad).
-      rate: [R, 3] velocity of `place`, 1/s.
-      free: [R, 3] acceleration of `place` without contacts, 1/s^2.
-      before: [R, 3] acceleration of `place` in the previous step, 1/s^2.
+      rate: [R, 3] rate of change of `place`, m/s, m/s, rad/s.
+      free: [R, 3] acceleration of `place` without contacts, m/s^2, m/s^2, rad/s^2.
+      before: [R, 3] acceleration of `place` in the previous step, m/s^2, m/s^2, rad/s^2.
       mobility: [R] 1 / mass, 1 / kg.
-      weight: [R] MuJoCo's inverse weight, 1 / kg.
-      agility: [R] 1 / moment of inertia, 1 / (kg m^2); only friction reads it.
+      weight: [R] MuJoCo's inverse weight (`body_invweight0`), 1 / kg.
+      agility: [R] 1 / moment of inertia, 1 / (kg m^2); only solvers with friction use it.
     """
 
     place: Array
@@ -174,18 +177,19 @@ def load_engine(model: mujoco.MjModel, ids: sim_model.Ids, radius: float, solve:
         "sim.solver=mjx on two cores, 3.9 times on an H200)"
     )
     fields = (np.float32(getattr(model, name)) for name in Model.__annotations__)
-    # `jnp.zeros` or `jnp.asarray` would be a program that a GPU has to load first.
+    # Copy NumPy arrays: `jnp.zeros` and `jnp.asarray` would be programs that a GPU has to load
+    # first.
     *fields, still = jax.device_put((*fields, np.zeros(model.nv, np.float32)))
-    data = Data(still, still, still, still)  # as many positions as velocities
+    data = Data(still, still, still, still)  # planar robots have as many positions as velocities
     return Engine(label, Model(*fields), data, functools.partial(step, discs), is_mjx=False)
 
 
 def _rounds(robots: int) -> np.ndarray:
-    """Builds a tournament: the robot that each robot meets in each round, [N, R].
+    """Splits the pairs of robots into rounds, in which each robot is in at most one pair, [N, R].
 
-    With an odd number N of robots, robots i and j meet in round (i + j) modulo N (the circle
-    method). The robot left over in a round meets none and gets its own index. With an even number
-    of robots, the robot left over meets the last robot instead.
+    This is the circle method for tournaments. With an odd number N of robots, robots i and j form a
+    pair in round (i + j) modulo N. The robot left over in a round has no partner and gets its own
+    index. With an even number of robots, the last robot is the partner of the robot left over.
     """
     rounds = robots - 1 + robots % 2
     player = np.arange(rounds)
@@ -234,8 +238,9 @@ def _robots(discs: Discs, model: Model, data: Data) -> DiscRobots:
 def spring(discs: Discs) -> tuple[float, float]:
     """Returns stiffness and damping, which are the same for all contacts.
 
-    They are k and b in MuJoCo's documentation (Modeling, "Solver parameters"), computed from
-    `solref`. The time constant in `solref` is at least two physics steps (`refsafe`).
+    These are k and b in MuJoCo's documentation (Modeling, "Solver parameters"), computed from
+    `solref`. A time constant in `solref` of less than two physics steps is raised to two
+    (`refsafe`).
 
     Args:
       discs: constants.

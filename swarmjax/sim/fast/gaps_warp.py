@@ -1,8 +1,8 @@
-"""Which robots touch each other, obstacles and walls: lists of contacts, in Warp.
+"""Lists the contacts of robots with each other, with obstacles and with walls, in Warp.
 
 Several threads compare all pairs of an arena. For large swarms, one thread per
-obstacle, wall and robot looks into the cells around it (`cells_warp`). Both list the same contacts
-in the same order.
+obstacle, wall and robot looks into the cells around it (`cells_warp`). Both ways list the same
+contacts in the same order.
 """
 
 # Warp's types know neither the arguments of a struct nor the argument `module`.
@@ -16,7 +16,8 @@ from swarmjax.sim import model as sim_model
 from swarmjax.sim.fast import cells_warp
 from swarmjax.sim.fast import discs as sim_discs
 
-# Edge of a cell in radii: 5 % more than a hull's diameter, for rounding.
+# Edge of a cell, in radii of the hull. It is 5 % more than a hull's diameter, to allow for
+# rounding.
 CELL = wp.constant(2.1)
 _DEEPEST = wp.constant(sim_discs.DEEPEST)
 _WALLS = wp.constant(sim_model.WALLS)
@@ -35,16 +36,17 @@ def list_by_cells(
     """Lists the contacts of many arenas as `list_contacts` does, by looking into cells.
 
     Args:
-      shape: N, K, A.
+      shape: N, K, A: the number of rows of `WarpArena.contact`, of contacts that fit into memory,
+        and of arenas.
       radius: radius of the hulls, m.
       place: [A, R, 3] x (m), y (m), yaw (rad).
-      side: [A] m.
+      side: [A] sides of the arenas, m.
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       numbers: as in `WarpArena`.
 
     Returns:
-      [A] number of contacts, which may be larger than K, and [N, K, A, 4] their rows 0 and 1, as in
-      `WarpArena`.
+      The number of contacts of each arena [A], which may be larger than K, and an array [N, K, A,
+      4] as `WarpArena.contact`, with rows 0 and 1 filled in.
     """
     arenas, robots = place.shape[:2]
     owners, width = (arenas, obstacle.shape[1] + sim_model.WALLS + robots), CELL * radius
@@ -61,25 +63,27 @@ def list_by_cells(
 
 @wp.struct
 class WarpArena:
-    """Arrays of an arena, which its threads read and write.
+    """Arrays of one arena, which the arena's threads read and write.
 
     Attributes:
-      place: [R] x, y (m), yaw (rad).
-      rate: [R] time derivative of `place`, m/s and rad/s.
-      free: [R] second derivative of `place` without contacts, m/s^2 and rad/s^2.
-      before: [R] second derivative of `place` in the previous step, m/s^2 and rad/s^2.
+      place: [R] x (m), y (m), yaw (rad).
+      rate: [R] rate of change of `place`, m/s, m/s, rad/s.
+      free: [R] acceleration of `place` without contacts, m/s^2, m/s^2, rad/s^2.
+      before: [R] acceleration of `place` in the previous step, m/s^2, m/s^2, rad/s^2.
       body: [R] 1 / mass, inverse weight, 1 / moment of inertia.
       side: side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
-      numbers: radius (m), stiffness (1/s^2), damping (1/s), `solimp` (5), friction, largest number
-        of sweeps, number of threads.
-      contact: [N, K, A] numbers of each contact of all arenas. Row 0 is x and y of the unit vector
-        along which it pushes, and two numbers of the solver; at first, the third is the gap, m. Row
-        1 is two numbers of the solver, the robot pushed along the vector, and the robot pushed
-        back; -1 for none. All other rows are the solver's.
+      numbers: [11] radius of the hulls (m), stiffness (1/s^2) and damping (1/s) of contacts, the
+        five numbers of `solimp`, friction, largest number of sweeps, number of threads per arena.
+      contact: [N, K, A] N rows of four numbers for each contact, for all arenas. Row 0 holds x and
+        y of the unit vector along which the contact pushes, and two numbers for the solver, the
+        first of which is the gap (m) until the solver overwrites it. Row 1 holds two numbers for
+        the solver, the robot that is pushed along the vector, and the robot that is pushed back, or
+        -1 if the contact has only one robot. All other rows are for the solver.
       total: [R] acceleration of x, y and yaw under the current forces.
       island: [R] the first robot of each robot's island.
-      after: [K, A] the contact that a thread solves after each contact of all arenas; -1 for none.
+      after: [K, A] the contact that a thread solves next after each contact, for all arenas; -1
+        after the last one.
       threads: number of threads of the arena.
       index: index of the arena.
     """
@@ -111,7 +115,7 @@ class WarpArena:
     return yes;
 """)
 def vote(yes: bool, threads: int) -> wp.uint32:
-    """Waits until all threads have written their results; returns a bit for each of the arena."""
+    """Waits until all threads have written their results; returns a bit per thread of the arena."""
     ...
 
 
@@ -124,7 +128,7 @@ def vote(yes: bool, threads: int) -> wp.uint32:
 #endif
 """)
 def any_votes(yes: bool) -> bool:
-    """Waits as `vote` does; returns whether any thread of the warp, of any arena, says yes."""
+    """Waits as `vote` does; returns whether `yes` is true in any thread of the CUDA warp."""
     ...
 
 
@@ -142,7 +146,7 @@ def ones(bits: wp.uint32) -> int:
 
 @wp.func
 def list_contacts(arena: WarpArena, thread: int) -> int:
-    """Lists the contacts with obstacles, walls and other robots; returns their number."""
+    """Lists all contacts of an arena, by comparing all pairs; returns the number of contacts."""
     robots, fixtures = arena.place.shape[0], arena.obstacle.shape[0] + _WALLS
     gaps, before = robots * (fixtures + robots), (wp.uint32(1) << wp.uint32(thread)) - wp.uint32(1)
     count, owner, robot = wp.int32(0), wp.int32(thread // robots), wp.int32(thread % robots)
@@ -165,7 +169,7 @@ def list_contacts(arena: WarpArena, thread: int) -> int:
 
 @wp.struct
 class WarpBox:
-    """A rectangle: centre (m), cosine and sine of its yaw, half edges (m)."""
+    """A rectangle: its centre (m), the cosine and sine of its yaw, and its half edges (m)."""
 
     x: float
     y: float
@@ -186,9 +190,10 @@ def _list_near(
     count: wp.array2d[int],
     contact: wp.array3d[wp.vec4],
 ) -> None:
-    """Lists the contacts of an obstacle, wall or robot with robots, from index `count` on.
+    """Lists the contacts of an obstacle, wall or robot (the owner), from index `count` on.
 
-    Sets `count` to their number. A robot has contacts only with the robots after it.
+    Sets `count` to the number of these contacts. If the owner is a robot, only contacts with robots
+    of a higher index are listed, so that each contact is listed once.
     """
     i, owner = wp.tid()
     arena = WarpArena()
@@ -219,9 +224,9 @@ def _list_near(
 def _list_robot(
     arena: WarpArena, start: int, count: int, box: WarpBox, owner: int, robot: int
 ) -> int:
-    """Lists a robot's contact with a robot before it, or with a box if there is no `owner`.
+    """Lists a robot's contact, if any, with the robot `owner`, or with a box if `owner` < 0.
 
-    The contacts from `start` on are in the order of the robots. Returns their new number.
+    The contacts from `start` on are sorted by the index of the robot. Returns their new number.
     """
     gap = _gap_to(arena, box, owner, robot)
     if not (gap[2] < 0.0):
@@ -238,7 +243,7 @@ def _list_robot(
 
 @wp.func
 def _gap_to(arena: WarpArena, box: WarpBox, owner: int, robot: int) -> wp.vec3:
-    """Returns the gap of a robot to a robot before it, or to a box if there is no `owner`."""
+    """Returns a robot's gap to the robot `owner` before it, or to a box if `owner` is negative."""
     if owner < 0:
         return _from_box(arena.place[robot], box, arena.numbers[0])
     if owner < robot:
@@ -248,14 +253,14 @@ def _gap_to(arena: WarpArena, box: WarpBox, owner: int, robot: int) -> wp.vec3:
 
 @wp.func
 def _last_robot(arena: WarpArena, k: int) -> int:
-    """Returns the later robot of a contact."""
+    """Returns the higher of the indices of a contact's robots."""
     sides = sides_of(arena.contact[1, k, arena.index])
     return wp.max(sides[0], sides[1])
 
 
 @wp.func
 def _box_of(arena: WarpArena, owner: int, width: float) -> WarpBox:
-    """Returns an obstacle, a wall, or a square of this width around a robot, in this order."""
+    """Returns an owner's box: an obstacle, a wall, or a square of this width around a robot."""
     obstacles = arena.obstacle.shape[0]
     if owner < obstacles:
         return _obstacle_box(arena, owner)
@@ -267,14 +272,14 @@ def _box_of(arena: WarpArena, owner: int, width: float) -> WarpBox:
 
 @wp.func
 def _obstacle_box(arena: WarpArena, m: int) -> WarpBox:
-    """Returns an obstacle."""
+    """Returns the box of an obstacle."""
     x, y, yaw = arena.obstacle[m, 0], arena.obstacle[m, 1], arena.obstacle[m, 2]
     return WarpBox(x, y, wp.cos(yaw), wp.sin(yaw), arena.obstacle[m, 3], arena.obstacle[m, 4])
 
 
 @wp.func
 def _wall_box(side: float, k: int) -> WarpBox:
-    """Returns the east, north, west or south wall, as in `model.fixture_rectangles`."""
+    """Returns the box of the east, north, west or south wall (`model.fixture_rectangles`)."""
     cos = wp.where(k % 2 == 1, 0.0, wp.where(k == 0, 1.0, -1.0))
     sin = wp.where(k % 2 == 0, 0.0, wp.where(k == 1, 1.0, -1.0))
     away = 0.5 * side + _THICKNESS
@@ -283,7 +288,7 @@ def _wall_box(side: float, k: int) -> WarpBox:
 
 @wp.func
 def _list_gap(arena: WarpArena, k: int, gap: wp.vec3, owner: int, robot: int) -> None:
-    """Lists a contact of a robot with a robot before it, or with a box if there is no `owner`."""
+    """Stores a robot's contact with the robot `owner`, or with a box if `owner` is negative."""
     if k < arena.contact.shape[1]:
         first, second = wp.where(owner < 0, robot, owner), wp.where(owner < 0, -1, robot)
         arena.contact[0, k, arena.index] = wp.vec4(gap[0], gap[1], gap[2], 0.0)
@@ -292,7 +297,7 @@ def _list_gap(arena: WarpArena, k: int, gap: wp.vec3, owner: int, robot: int) ->
 
 @wp.func
 def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
-    """Returns x and y of the unit vector from a box to a robot, and the gap between them, m.
+    """Returns x and y of the unit vector from a box to a robot, and their gap (m).
 
     The gap is measured from the box's point nearest to the hull's centre. A centre within the box
     has no such point, so its gap is measured from the nearest face, unless that face is the top or
@@ -321,8 +326,8 @@ def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
 def _from_disc(arena: WarpArena, i: int, j: int) -> wp.vec3:
     """Returns the unit vector from the second robot to the first, and their gap, m.
 
-    Two hulls at the same place push each other along x, as in MuJoCo. The first is pushed towards
-    negative x.
+    Two hulls at the same place push each other along x, as in MuJoCo; the first robot is pushed
+    towards negative x.
     """
     away = arena.place[i] - arena.place[j]
     apart = wp.length(wp.vec2(away[0], away[1]))

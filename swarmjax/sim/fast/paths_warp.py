@@ -1,10 +1,10 @@
 """Shortest paths around obstacles in Warp; replaces the JAX code of `task/geodesic.py`.
 
-For each pair of corners, a thread checks whether they see each other. For each robot, a thread
-settles the corners outwards from the robot's target (Dijkstra 1959, "A Note on Two Problems in
-Connexion with Graphs"). Another thread per robot finds the first corner of the robot's path. This
-thread checks obstacles only for corners that could shorten the path. For a GPU, XLA would take
-minutes to compile the JAX code.
+For each pair of corners, a thread checks whether the straight line between them is free. For each
+robot, a thread finds the shortest distance from each corner to the robot's target, nearest corners
+first (Dijkstra 1959, "A Note on Two Problems in Connexion with Graphs"). Another thread per robot
+finds the first corner of the robot's own path. This thread looks for obstacles only on the way to
+corners that could shorten the path. XLA would take minutes to compile the JAX code for a GPU.
 """
 
 from functools import partial
@@ -22,7 +22,7 @@ _OPEN, _SETTLED = wp.constant(0), wp.constant(1)
 def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array:
     """Measures the straight lines between the corners of an arena.
 
-    `vmap` adds arenas to the same kernel.
+    Under `vmap`, one kernel computes all arenas.
 
     Args:
       corner: [K, 2] x and y, m.
@@ -39,7 +39,7 @@ def find_legs(corner: Array, side: Array, frame: Array, widened: float) -> Array
 
 
 def settle(target: Array, corner: Array, frame: Array, legs: Array, widened: float) -> Array:
-    """Finds the distance from each corner to each target.
+    """Finds the length of the shortest path from each corner to each target.
 
     Args:
       target: [R, 2] x and y, m.
@@ -59,13 +59,13 @@ def settle(target: Array, corner: Array, frame: Array, legs: Array, widened: flo
 def measure(
     place: Array, target: Array, corner: Array, to_go: Array, frame: Array, widened: float
 ) -> Array:
-    """Measures the shortest paths.
+    """Measures the shortest path from each robot to its target.
 
     Args:
       place: [R, 2] places of the robots: x and y, m.
       target: [R, 2] x and y, m.
       corner: [K, 2] x and y, m.
-      to_go: [R, K] distance from each corner to each target, m.
+      to_go: [R, K] result of `settle`.
       frame: [M, 6] obstacles, as for `find_legs`.
       widened: width added around obstacles, m.
 
@@ -82,7 +82,7 @@ def _run(kernel: str, threads: tuple, shapes: dict, widened: float, *inputs: Arr
 
 
 def _launch(kernel: str, threads: tuple, shapes: dict, widened: float, *inputs: Array) -> Array:
-    """Runs a kernel for many arenas, with these threads and shapes of outputs for each."""
+    """Runs a kernel for many arenas; `threads` and `shapes` (of outputs) are those of one arena."""
     arenas = len(inputs[0])
     call = wp.jax_kernel(globals()[kernel], num_outputs=len(shapes))
     sizes = {name: (arenas, *shape) for name, shape in shapes.items()}
@@ -94,7 +94,7 @@ def _launch(kernel: str, threads: tuple, shapes: dict, widened: float, *inputs: 
 def _is_barred(
     frame: wp.array3d[float], arena: int, widened: float, begin: wp.vec2, end: wp.vec2
 ) -> bool:
-    """Returns whether a segment meets a widened obstacle: separating axes, as in `geodesic.py`."""
+    """Returns whether a segment meets a widened obstacle (separating axes, as in `geodesic.py`)."""
     barred = wp.bool(False)
     m = wp.int32(0)
     while m < frame.shape[1] and not barred:
@@ -147,7 +147,7 @@ def _settle_corners(
     state: wp.array3d[int],
     to_go: wp.array3d[float],
 ) -> None:
-    """Settles the corners of an arena, starting with those that the target sees."""
+    """Finds the distance from each corner to a target, beginning with corners in sight of it."""
     arena, robot = wp.tid()
     goal, corners = target[arena, robot], corner.shape[1]
     for k in range(corners):

@@ -1,7 +1,8 @@
-"""Contacts of planar robots in JAX: all robots of an arena at once, sweep by sweep.
+"""Solves the contacts of planar robots in JAX, for all robots of an arena at once.
 
-`discs` describes the problem and the order of a sweep. Each fixture is one row for all robots. Each
-round of the tournament, in which each robot meets one other robot, is also one row.
+`discs` describes the problem and the order of a sweep. Arrays [K, R] hold the contacts: each
+fixture (obstacle or wall) has one row, with one entry per robot. Each round of `discs._rounds`, in
+which each robot forms a pair with one other robot, also has one row.
 """
 
 import operator
@@ -24,7 +25,7 @@ class DiscGap(NamedTuple):
     Attributes:
       x: x of the unit vector along which the robot is pushed.
       y: y of the same unit vector.
-      distance: distance between the surfaces, m; negative for contact.
+      distance: distance between the surfaces, m; negative if they touch.
     """
 
     x: Array
@@ -33,13 +34,14 @@ class DiscGap(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A gap, and the contact's parameters if it is closed.
+    """A gap, and the parameters of the contact that exists if the gap is negative.
 
     Attributes:
       gap: gap between the robot and the object.
-      give: softness R: a unit of force misses the demand by this acceleration, 1 / kg.
+      give: softness R, 1 / kg: with a unit of force, the acceleration falls short of the demand by
+        this much.
       demand: aref, requested acceleration along the gap, m/s^2.
-      stiffness: J M^-1 J' + R, effect of a unit of force, 1 / kg.
+      stiffness: J M^-1 J' + R, the effect of a unit of force including softness, 1 / kg.
     """
 
     gap: DiscGap
@@ -49,7 +51,7 @@ class Contact(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Velocities or accelerations, of robots or of pairs of robots (`turn` is then a sum)."""
+    """Velocities or accelerations of robots, or of robots relative to others (see `_minus`)."""
 
     x: Array
     y: Array
@@ -61,7 +63,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
     Args:
       discs: constants.
-      robots: their state, and their accelerations without contacts.
+      robots: the state of the robots, and their accelerations without contacts.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -91,7 +93,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
-    """Returns all contacts [K, R] of robots: with the fixtures [F, 5], then with opponents."""
+    """Returns all possible contacts [K, R]: first with the fixtures [F, 5], then with opponents."""
     x, y, other = robots.place[:, 0], robots.place[:, 1], discs.opponent
     to_fixture = _from_box(x, y, turned(fixture[:, None], jnp), discs.radius)
     meets = other - np.arange(len(x))
@@ -110,7 +112,7 @@ def contacts(discs: Discs, robots: DiscRobots, fixture: Array) -> Contact:
 
 
 def of_others(discs: Discs, of_robots: Array, contacts: int) -> Array:
-    """Returns the values [K, R] of the robots that robots [R] may touch; 0 for fixtures."""
+    """Returns the values [K, R] of the robots that each robot may touch; 0 for fixtures."""
     still = jnp.zeros((contacts - len(discs.opponent), len(of_robots)))
     return jnp.concatenate([still, of_robots[discs.opponent]])
 
@@ -121,7 +123,7 @@ def against(discs: Discs, motion: Motion, contacts: int) -> Motion:
 
 
 def against_row(discs: Discs, motion: Motion, row: int, contacts: int) -> Motion:
-    """Returns one row of `against`."""
+    """Returns the row with index `row` of `against`."""
     meeting = row + len(discs.opponent) - contacts
     if meeting < 0:
         return motion
@@ -129,15 +131,16 @@ def against_row(discs: Discs, motion: Motion, row: int, contacts: int) -> Motion
 
 
 def _minus(motion: Motion, other: Motion) -> Motion:
-    """Returns a motion relative to another.
+    """Returns the motion of robots relative to that of other robots.
 
-    Two robots that turn the same way slide on each other at twice the speed, so turns are added.
+    If two robots turn the same way, their surfaces slide on each other at the sum of both speeds,
+    so the turn rates are added.
     """
     return Motion(motion.x - other.x, motion.y - other.y, motion.turn + other.turn)
 
 
 def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion:
-    """Adds the accelerations due to forces [K, R]."""
+    """Returns the accelerations `free` plus those due to the forces [K, R]."""
     x, y = (jnp.sum(way * force, axis=0) for way in (gap.x, gap.y))
     return Motion(free.x + mobility * x, free.y + mobility * y, free.turn)
 
@@ -145,7 +148,7 @@ def _pushed(gap: DiscGap, mobility: Array, free: Motion, force: Array) -> Motion
 def _sweep(
     discs: Discs, contacts: Contact, mobility: Array, motion: Motion, force: Array
 ) -> tuple[Array, Motion]:
-    """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
+    """Sets the forces [K, R] to their optimal values row by row, all robots of a row at once."""
     forces = []
     for k, now in enumerate(force):
         one = jax.tree.map(operator.itemgetter(k), contacts)
@@ -158,7 +161,7 @@ def _sweep(
 
 
 def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
-    """Returns the gap between boxes and robots at x and y, m.
+    """Returns the gaps between boxes and robots whose centres are at x and y (m).
 
     The gap is measured from the box's point nearest to the hull's centre. A centre within the box
     has no such point, so its gap is measured from the nearest face, unless that face is the top or
@@ -180,7 +183,7 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
 
 
 def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
-    """Returns the gap between robots and others; x and y (m) lead from the others to the robots.
+    """Returns the gaps between robots and others; the vector (x, y) in m points to the robots.
 
     Two hulls at the same place push each other along x, as in MuJoCo. In each pair, `ahead` is 1
     for one robot and -1 for the other. The robot with 1 is pushed towards negative x.
@@ -191,25 +194,25 @@ def _from_disc(x: Array, y: Array, ahead: Array, radius: float) -> DiscGap:
 
 
 def along(gap: DiscGap, motion: Motion) -> Array:
-    """Returns J a: how fast robots move away from the others, given their relative motion."""
+    """Returns J a, the part of a relative motion in which a robot moves away from the object."""
     return gap.x * motion.x + gap.y * motion.y
 
 
 def _first_force(one: Contact, motion: Motion) -> Array:
-    """Returns the force, N, of a contact at this relative motion."""
+    """Returns the force (N) that a contact has at this relative acceleration."""
     force = jnp.maximum((one.demand - along(one.gap, motion)) / one.give, 0.0)
     return jnp.where(one.gap.distance < 0.0, force, 0.0)
 
 
 def _best_force(one: Contact, motion: Motion, force: Array) -> Array:
-    """Returns the best force, N, of a contact while all other forces stay the same."""
+    """Returns the optimal force (N) of a contact while all other forces stay the same."""
     short = one.demand - along(one.gap, motion) - one.give * force
     best = jnp.maximum(force + short / one.stiffness, 0.0)
     return jnp.where(one.gap.distance < 0.0, best, 0.0)
 
 
 def _impedance(discs: Discs, distance: Array) -> Array:
-    """Returns the impedance at distances (m): MuJoCo, "Solver parameters", d(r) of `solimp`."""
+    """Returns impedances at distances (m): d(r) in MuJoCo's documentation, "Solver parameters"."""
     least, most, width, middle, power = (float(x) for x in discs.solimp)
     share = jnp.minimum(jnp.abs(distance) / width, 1.0)
     before = share**power / middle ** (power - 1.0)

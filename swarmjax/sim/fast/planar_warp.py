@@ -1,7 +1,7 @@
-"""Forces between planar robots without friction, in Warp.
+"""Solves the contact forces of planar robots without friction, in Warp.
 
-`discs` describes the problem, `contacts_warp` the kernel. A thread sweeps through its contacts
-until no force changes.
+`discs` describes the problem, and `contacts_warp` describes the kernel. A thread sweeps through its
+contacts until no force changes any more.
 """
 
 import functools
@@ -18,8 +18,8 @@ _TOLERANCE = wp.constant(discs.TOLERANCE)
 def _solve(arena: WarpArena, first: int) -> None:
     """Finds the forces, and the accelerations that they cause.
 
-    Row 0 of a contact becomes x, y, aref, and J M^-1 J' + R. Row 1 becomes R, the force (N), and
-    both robots.
+    In `WarpArena.contact`, row 0 becomes x and y of the unit vector, aref, and J M^-1 J' + R. Row 1
+    becomes R, the force (N), and both robots.
     """
     k = wp.int32(first)
     while k >= 0:
@@ -41,7 +41,7 @@ def _solve(arena: WarpArena, first: int) -> None:
 
 @wp.func
 def _begin(arena: WarpArena, k: int) -> None:
-    """Computes the parameters of a contact, and starts with an initial force."""
+    """Computes the parameters of a contact, and applies its initial force."""
     gap = arena.contact[0, k, arena.index]
     sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
     body = contacts_warp.body_of(arena, sides)
@@ -59,7 +59,7 @@ def _begin(arena: WarpArena, k: int) -> None:
 
 @wp.func
 def _along(motion: wp.array[wp.vec3], row: wp.vec4, sides: wp.vec2i) -> float:
-    """Returns J a: how fast the two sides of a contact move apart."""
+    """Returns J a, the part of a motion in which the two sides of a contact move apart."""
     apart = motion[sides[0]]
     if sides[1] >= 0:
         apart = apart - motion[sides[1]]
@@ -77,7 +77,7 @@ def _push(arena: WarpArena, row: wp.vec4, sides: wp.vec2i, force: float) -> None
 
 @wp.func
 def _sweep(arena: WarpArena, first: int) -> bool:
-    """Sets each force to its best value, given the others; returns whether any force changed."""
+    """Sets each force to its optimum, given the other forces; returns whether any force changed."""
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
     k = wp.int32(first)

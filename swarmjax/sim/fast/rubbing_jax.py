@@ -1,21 +1,24 @@
-"""Contacts of planar robots with friction, in JAX; `planar_jax` is the version without friction.
+"""Solves contacts of planar robots with friction, in JAX; `planar_jax` is for no friction.
 
-A contact has two forces within the cone |rub| <= friction * push: a push along the normal and a rub
-along the face. This is MuJoCo's elliptic cone of condim 3. The third force is vertical, where no
-joint moves, and stays 0. The push acts through the robot's centre, and the rub acts with a lever
-arm. Push and rub move the robot in different ways, so for one contact the problem
+A contact has two forces: a push along the normal and a rub along the face, within the cone |rub| <=
+friction * push. This is MuJoCo's elliptic cone with condim 3. The third force of condim 3 is
+vertical; no joint moves in this direction, so it stays 0. The push acts through the robot's centre,
+and the rub acts with a lever arm. Neither force changes the acceleration along the other, so for
+one contact the problem
 
     minimise over the cone:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref)
 
-is two separate parabolas. The least point of their sum in the cone has a closed form (`project`).
-Projected Gauss-Seidel then goes through contacts instead of forces. A step sets one contact to its
-best forces while the other forces stay the same.
+is a sum of two parabolas, one for each force. The minimum of this sum in the cone has a closed form
+(`project`). Projected Gauss-Seidel therefore updates contacts one by one, not forces: an update
+sets both forces of a contact to their optimum, while the forces of all other contacts stay the
+same.
 
-Wedged robots pass a force back and forth, and the force shrinks only a little in each sweep. An
-arena may take up to 200 sweeps, and all arenas of a call wait for the slowest arena. So between
-sweeps, forces leap to where the last three sweeps are heading (`_leap`). This is Anderson
-acceleration (D. G. Anderson, Iterative Procedures for Nonlinear Integral Equations, J. ACM 12,
-1965) with a memory of two sweeps. docs/performance.md compares this method with alternatives.
+Wedged robots pass a force back and forth, and the force changes only a little in each sweep. An
+arena may take up to 200 sweeps, and all arenas that are stepped together wait for the slowest one.
+To converge sooner, forces are extrapolated between sweeps, from the last three sweeps (a "leap",
+see `_leap`). This is Anderson acceleration (D. G. Anderson, Iterative Procedures for Nonlinear
+Integral Equations, J. ACM 12, 1965) with a memory of two sweeps. docs/performance.md compares this
+method with alternatives.
 """
 
 import functools
@@ -31,20 +34,20 @@ from swarmjax.sim.fast import planar_jax
 from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, spring
 from swarmjax.sim.fast.planar_jax import DiscGap, Motion, against, against_row, of_others
 
-KEPT = 3  # sweeps that a leap uses; a fourth saves 3 % in s6 (docs/performance.md)
-# Relative increase of a sum of squares. The increase is ten times float32's rounding. Without the
-# increase, rounding may turn the sum into 0.
+KEPT = 3  # sweeps that a leap uses; a fourth would save only 3 % in stage s6 (docs/performance.md)
+# Relative increase of a sum of squares that is used as a divisor. Without it, rounding could make
+# the divisor 0. The increase is ten times float32's rounding.
 ROUNDING = 1e-6
 # Relative error of an acceleration after two roundings in float32. Smaller changes of an
-# acceleration are ignored. Otherwise, 3 of 20,000 random crowds never came to rest. In these
-# crowds, hulls were grazed at speed. All arenas wait for such a crowd.
+# acceleration are ignored. Without this limit, sweeps never converged in 3 of 20,000 random crowds,
+# where hulls grazed each other at high speed, and all arenas wait for such a crowd.
 FLOOR = 2.4e-7
 
 
 class Force(NamedTuple):
-    """Forces of a contact, N, or what belongs to them: along its normal, and along its face.
+    """Two numbers of a contact, along its normal and along its face: forces (N), or parameters.
 
-    The face points counter-clockwise around the robot.
+    The direction along the face is counter-clockwise around the robot.
     """
 
     push: Array
@@ -52,14 +55,15 @@ class Force(NamedTuple):
 
 
 class Touch(NamedTuple):
-    """A gap, and the contact's parameters if it is closed.
+    """A gap, and the parameters of the contact that exists if the gap is negative.
 
     Attributes:
       gap: gap between the robot and the object.
-      arm: lever arm from the robot's centre to the contact, m; 0 without contact.
-      give: softness R: a unit of force misses the demand by this acceleration, 1 / kg.
+      arm: lever arm from the robot's centre to the contact, m; 0 if there is no contact.
+      give: softness R, 1 / kg: with a unit of force, the acceleration falls short of the demand by
+        this much.
       demand: aref, requested accelerations, m/s^2.
-      stiffness: J M^-1 J' + R, effects of a unit of force, 1 / kg.
+      stiffness: J M^-1 J' + R, the effect of a unit of each force including softness, 1 / kg.
     """
 
     gap: DiscGap
@@ -70,7 +74,7 @@ class Touch(NamedTuple):
 
 
 class Swept(NamedTuple):
-    """The result of a sweep: the forces of all contacts, and their change in the sweep."""
+    """The result of a sweep: the forces of all contacts after it, and their changes in it."""
 
     force: Force
     change: Force
@@ -80,8 +84,8 @@ class Search(NamedTuple):
     """Progress of the sweeps.
 
     Attributes:
-      done: [] sweeps.
-      force: forces to continue from.
+      done: [] number of sweeps so far.
+      force: forces with which the next sweep starts.
       motion: accelerations under these forces.
       last: result of the last sweep.
       before: result of the sweep before the last.
@@ -101,7 +105,7 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
     Args:
       discs: constants.
-      robots: their state, and their accelerations without contacts.
+      robots: the state of the robots, and their accelerations without contacts.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
 
@@ -126,21 +130,21 @@ def push_apart(discs: Discs, robots: DiscRobots, side: Array, obstacle: Array) -
 
 
 def _least_change(touch: Touch, motion: Motion) -> Array:
-    """Returns the force, N, that rounding can cause; smaller changes are to be ignored."""
+    """Returns the change of a force (N) that rounding can cause; smaller changes are ignored."""
     size = jnp.abs(motion.x) + jnp.abs(motion.y) + touch.arm * jnp.abs(motion.turn)
     closed = touch.gap.distance < 0.0
     return FLOOR * jnp.max(jnp.where(closed, size / touch.stiffness.push, 0.0))
 
 
 def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Search) -> Search:
-    """Makes one sweep, and then a leap if that is allowed."""
+    """Makes one sweep, and then a leap unless it could prevent convergence."""
     force, motion = _sweep(discs, touch, robots, now.motion, now.force)
     swept = Swept(force, _minus(force, now.force))
     largest = jnp.max(jnp.stack([jnp.abs(each) for each in swept.change]))
     moves = largest > jnp.maximum(TOLERANCE * jnp.max(force.push), least)
     done = now.done + 1
-    # Leap only while changes shrink; otherwise leaps could go around in circles. Do not leap in the
-    # second half of the sweeps, since plain sweeps always come to rest.
+    # Leap only while changes shrink; otherwise leaps could repeat in a cycle. Do not leap in the
+    # second half of the allowed sweeps, since sweeps without leaps always converge.
     leaps = moves & (done >= KEPT) & (2 * done <= discs.sweeps)
     leaps &= _dot(swept.change, swept.change) <= _dot(now.last.change, now.last.change)
     leapt = _leap(discs, touch, swept, now, leaps)
@@ -149,10 +153,10 @@ def _go_on(discs: Discs, touch: Touch, robots: DiscRobots, least: Array, now: Se
 
 
 def _leap(discs: Discs, touch: Touch, swept: Swept, now: Search, leaps: Array) -> Force:
-    """Returns the mix of the last three sweeps' forces that should change least in the next sweep.
+    """Returns the mix of the last three sweeps' forces that the next sweep should change least.
 
-    This assumes that a sweep is a linear map. A sweep is linear as long as no contact starts or
-    stops pushing, sticking or slipping.
+    This assumes that a sweep is an affine map of the forces, which holds as long as no contact
+    starts or stops pushing, sticking or slipping.
     """
     newer, older = _minus(swept.change, now.last.change), _minus(now.last.change, now.before.change)
     by_newer, by_older = (jnp.where(leaps, x, 0.0) for x in _weights(swept.change, newer, older))
@@ -181,7 +185,7 @@ def _minus(one: Force, other: Force) -> Force:
 
 
 def _touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
-    """Lists all possible contacts [K, R], in the order of `planar_jax.contacts`."""
+    """Returns all possible contacts [K, R], in the order of `planar_jax.contacts`."""
     gap, give, demand, stiffness = planar_jax.contacts(discs, robots, fixture)
     # MuJoCo puts a contact midway between the two surfaces.
     arm = jnp.where(gap.distance < 0.0, discs.radius + 0.5 * gap.distance, 0.0)
@@ -193,7 +197,7 @@ def _touches(discs: Discs, robots: DiscRobots, fixture: Array) -> Touch:
 
 
 def _slide(gap: DiscGap, arm: Array, motion: Motion) -> Array:
-    """Returns J a along the face: how fast the robot's rim slides on the touched object."""
+    """Returns J a along the face, the part of a motion in which rim and touched object slide."""
     return gap.x * motion.y - gap.y * motion.x - arm * motion.turn
 
 
@@ -207,7 +211,7 @@ def _kick(touch: Touch, robots: DiscRobots, force: Force) -> Motion:
 
 
 def _moved(touch: Touch, robots: DiscRobots, free: Motion, force: Force) -> Motion:
-    """Adds the accelerations due to forces [K, R]."""
+    """Returns the accelerations `free` plus those due to the forces [K, R]."""
     kick = _kick(touch, robots, force)
     return Motion(*(a + jnp.sum(b, axis=0) for a, b in zip(free, kick, strict=True)))
 
@@ -215,7 +219,7 @@ def _moved(touch: Touch, robots: DiscRobots, free: Motion, force: Force) -> Moti
 def _sweep(
     discs: Discs, touch: Touch, robots: DiscRobots, motion: Motion, force: Force
 ) -> tuple[Force, Motion]:
-    """Sets the forces [K, R] to their best values, row by row, for all robots of a row at once."""
+    """Sets the forces [K, R] to their optimal values row by row, all robots of a row at once."""
     forces: list[Force] = []
     for k in range(len(force.push)):
         one, now = jax.tree.map(operator.itemgetter(k), (touch, force))
@@ -229,43 +233,44 @@ def _sweep(
 
 
 def _first_force(discs: Discs, touch: Touch, motion: Motion) -> Force:
-    """Returns the forces of contacts at this relative motion."""
+    """Returns the forces that contacts have at this relative acceleration."""
     force = Force(*(short / touch.give for short in _short(touch, motion)))
     return _best(discs, touch, force, Force(touch.give, touch.give))
 
 
 def _best_force(discs: Discs, touch: Touch, motion: Motion, force: Force) -> Force:
-    """Returns the best forces of a contact while all other forces stay the same."""
+    """Returns the optimal forces of contacts while the forces of all others stay the same."""
     each = zip(force, _short(touch, motion), touch.stiffness, strict=True)
     wanted = Force(*(now + (short - touch.give * now) / k for now, short, k in each))
     return _best(discs, touch, wanted, touch.stiffness)
 
 
 def _short(touch: Touch, motion: Motion) -> Force:
-    """Returns how far accelerations fall short of the contacts' demands, m/s^2."""
+    """Returns by how much accelerations fall short of the contacts' demands, m/s^2."""
     push = touch.demand.push - planar_jax.along(touch.gap, motion)
     return Force(push, touch.demand.rub - _slide(touch.gap, touch.arm, motion))
 
 
 def _best(discs: Discs, touch: Touch, wanted: Force, weight: Force) -> Force:
-    """Returns the best forces of closed gaps, given the best ones outside the cone; 0 if open."""
+    """Returns `wanted` projected onto the friction cone; 0 where gaps are open."""
     closed, force = touch.gap.distance < 0.0, project(wanted, *weight, discs.friction)
     return Force(*(jnp.where(closed, each, 0.0) for each in force))
 
 
 def project(force: Force, push: Array, rub: Array, friction: Any) -> Force:
-    """Returns the point of the cone |rub| <= friction * push that is nearest to these forces.
+    """Projects forces onto the cone |rub| <= friction * push, by weighted distance.
 
     Args:
       force: forces that may lie outside the cone.
       push: weight of the squared deviation of the push; above 0.
       rub: weight of the squared deviation of the rub; above 0.
-      friction: 0 or above.
+      friction: friction coefficient, 0 or above.
 
     Returns:
-      The forces themselves, if they lie in the cone; otherwise the nearest point of the cone's edge
-      on the same side, or the cone's tip. The nearest point of an edge is the least point of the
-      parabola along (1, friction).
+      The point of the cone with the least weighted sum of squared deviations. If the forces lie in
+      the cone, these are the forces themselves. Otherwise it is a point on the edge of the cone on
+      the same side, or the cone's tip. Along the edge, in the direction (1, friction), the sum is a
+      parabola, which has its minimum at this point.
     """
     size = jnp.abs(force.rub)
     edge = push * force.push + friction * rub * size

@@ -1,6 +1,6 @@
-"""Forces between planar robots with friction, in Warp.
+"""Solves the contact forces of planar robots with friction, in Warp.
 
-`rubbing_jax` describes the problem, `contacts_warp` the kernel.
+`rubbing_jax` describes the problem, and `contacts_warp` describes the kernel.
 """
 
 import functools
@@ -16,18 +16,18 @@ _TOLERANCE = wp.constant(TOLERANCE)
 _KEPT = wp.constant(KEPT)
 _ROUNDING = wp.constant(ROUNDING)
 _FLOOR = wp.constant(FLOOR)
-_PAST = wp.constant(3)  # first of the rows of past forces
+_PAST = wp.constant(3)  # first row of `WarpArena.contact` that holds forces of past sweeps
 
 
 @wp.struct
 class WarpSwept:
-    """The result of a sweep, with the sums over contacts that the next leap needs.
+    """The result of a sweep: sums over contacts that the next leap needs.
 
-    Let r be the changes of this sweep. Let a be r minus the changes of the last sweep, and b the
-    changes of the last sweep minus those of the sweep before it.
+    In the following, r is the changes of all forces in this sweep, p those in the previous sweep,
+    and q those in the sweep before the previous one; a = r - p, and b = p - q.
 
     Attributes:
-      moves: whether a force changed.
+      moves: whether this sweep changed a force.
       size: r . r.
       newer: a . a.
       both: a . b.
@@ -47,11 +47,12 @@ class WarpSwept:
 
 @wp.func
 def _solve(arena: WarpArena, first: int) -> None:
-    """Sweeps until no force changes, with leaps in between (`rubbing_jax.solve`).
+    """Sweeps until no force changes any more, with leaps in between, as `rubbing_jax` does.
 
-    Row 0 of a contact becomes x, y, its arm (m), and R. Row 1 becomes push and rub (N), and both
-    robots. Row 2 is aref of push and rub, and J M^-1 J' + R of both. The last `KEPT` rows are push
-    and rub after a sweep, and their changes in that sweep; sweep i is in row i modulo `KEPT`.
+    In `WarpArena.contact`, row 0 becomes x and y of the unit vector, the lever arm (m), and R. Row
+    1 becomes push and rub (N), and both robots. Row 2 becomes aref of push and of rub, and J M^-1
+    J' + R of push and of rub. Each of the last `KEPT` rows holds push and rub after a sweep, and
+    their changes in that sweep; sweep i is in row i modulo `KEPT` of these rows.
     """
     k = wp.int32(first)
     while k >= 0:
@@ -81,7 +82,7 @@ def _solve(arena: WarpArena, first: int) -> None:
 
 @wp.func
 def _begin(arena: WarpArena, k: int) -> None:
-    """Computes the parameters of a contact, and starts with initial forces."""
+    """Computes the parameters of a contact, and applies its initial forces."""
     gap = arena.contact[0, k, arena.index]
     sides = gaps_warp.sides_of(arena.contact[1, k, arena.index])
     body = contacts_warp.body_of(arena, sides)
@@ -112,7 +113,7 @@ def _hold(arena: WarpArena, k: int, force: wp.vec2, sides: wp.vec2i) -> None:
 
 @wp.func
 def _slide(motion: wp.array[wp.vec3], row: wp.vec4, sides: wp.vec2i) -> wp.vec2:
-    """Returns J a: how fast the two sides of a contact move apart, and how fast they slide."""
+    """Returns J a: the parts of a motion in which a contact's sides move apart, and slide."""
     apart = _apart(motion, sides)
     along = row[0] * apart[1] - row[1] * apart[0] - row[2] * apart[2]
     return wp.vec2(row[0] * apart[0] + row[1] * apart[1], along)
@@ -141,7 +142,7 @@ def _push(arena: WarpArena, row: wp.vec4, sides: wp.vec2i, force: wp.vec2) -> No
 
 @wp.func
 def _push_robot(arena: WarpArena, robot: int, push: wp.vec3) -> None:
-    """Adds a robot's acceleration due to a push and a torque."""
+    """Adds a robot's acceleration due to a force along x and y and a torque."""
     body = arena.body[robot]
     kick = wp.vec3(body[0] * push[0], body[0] * push[1], body[2] * push[2])
     arena.total[robot] = arena.total[robot] + kick
@@ -160,7 +161,7 @@ def _project(force: wp.vec2, push: float, rub: float, friction: float) -> wp.vec
 
 @wp.func
 def _least_change(arena: WarpArena, first: int) -> float:
-    """Returns the force, N, that rounding can cause, as in `rubbing_jax`."""
+    """Returns the change of a force (N) that rounding can cause (`rubbing_jax._least_change`)."""
     largest = wp.float32(0.0)
     k = wp.int32(first)
     while k >= 0:
@@ -175,7 +176,7 @@ def _least_change(arena: WarpArena, first: int) -> float:
 
 @wp.func
 def _sweep(arena: WarpArena, first: int, index: int, least: float) -> WarpSwept:
-    """Sets all forces to their best values, contact by contact."""
+    """Sets all forces to their optimal values, contact by contact."""
     swept = WarpSwept()
     largest = wp.float32(0.0)
     change = wp.float32(0.0)
@@ -203,7 +204,7 @@ def _sweep(arena: WarpArena, first: int, index: int, least: float) -> WarpSwept:
 
 @wp.func
 def _remember(arena: WarpArena, swept: WarpSwept, k: int, index: int, now: wp.vec4) -> WarpSwept:
-    """Stores the forces and changes of a contact after a sweep, and adds to the sums."""
+    """Stores a contact's forces after a sweep and their changes, and adds them to the sums."""
     last = arena.contact[_PAST + (index + 2) % _KEPT, k, arena.index]
     before = arena.contact[_PAST + (index + 1) % _KEPT, k, arena.index]
     arena.contact[_PAST + index % _KEPT, k, arena.index] = now
@@ -221,7 +222,7 @@ def _remember(arena: WarpArena, swept: WarpSwept, k: int, index: int, now: wp.ve
 
 @wp.func
 def _weights(swept: WarpSwept) -> wp.vec2:
-    """Returns the weights of the newer and the older step in a leap (`rubbing_jax`)."""
+    """Returns the weights of the newer and the older step in a leap (`rubbing_jax._weights`)."""
     if not (swept.older > 0.0):
         return wp.vec2(0.0, 0.0)
     both = swept.both / swept.older
@@ -234,7 +235,7 @@ def _weights(swept: WarpSwept) -> wp.vec2:
 
 @wp.func
 def _leap(arena: WarpArena, first: int, index: int, weights: wp.vec2) -> None:
-    """Continues from the mix of the last three sweeps' forces that should change least."""
+    """Sets the forces to a mix of the last three sweeps' forces (`rubbing_jax._leap`)."""
     k = wp.int32(first)
     while k >= 0:
         force = arena.contact[1, k, arena.index]

@@ -1,8 +1,9 @@
-"""What surrounds each robot, in one Warp kernel instead of some XLA kernels.
+"""Finds what surrounds each robot, in one Warp kernel instead of several XLA kernels.
 
-The functions are those of `infrared` and `gaps`. Threads look only at the robots in the cells
-around their own (`cells_warp`), and skip boxes that are too far away. XLA would compute
-each ray to each box, and list the neighbours by sorting.
+The results equal those of `infrared` and `gaps`. A thread computes rays and gaps of one robot. It
+looks only at other robots in the cells around this robot (`cells_warp`), and skips boxes that are
+too far away. XLA would compute each ray to each box, and would sort the robots to list those near
+each robot.
 """
 
 # Warp's types know neither the arguments of a struct nor those of an array.
@@ -24,14 +25,14 @@ from swarmjax.sim.gaps import KINDS
 from swarmjax.sim.infrared import Mount
 from swarmjax.sim.senses import Scene
 
-_SLACK = wp.constant(1.01)  # robots look a little further than needed, because numbers are rounded
-_THREADS = 2**18  # threads of all arenas, beyond which more of them for a robot do not help
+_SLACK = wp.constant(1.01)  # look a little further than needed, because numbers are rounded
+_THREADS = 2**18  # threads of all arenas together; more do not help
 _BOX, _WALL = wp.constant(KINDS.index("obstacle")), wp.constant(KINDS.index("wall"))
 _MISS = wp.constant(float("inf"))
 
 
 def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, limit: float) -> Array:
-    """Looks around from each robot of an arena; `vmap` adds arenas to the same kernel.
+    """Looks around from each robot of an arena; under `vmap`, one kernel computes all arenas.
 
     Args:
       scene: an arena.
@@ -40,8 +41,9 @@ def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, lim
       limit: range of a sensor from its own origin, m.
 
     Returns:
-      [K + 3, R, 2] m, and reflectances. The first K rows are the rays, the others the gaps to the
-      nearest `gaps.KINDS`. A gap above `limit` is any number above it, or infinite.
+      [K + 3, R, 2] distances (m), and reflectances of what is at these distances. The first K rows
+      are ray lengths; the last three are the gaps to the nearest object of each of `gaps.KINDS`. A
+      gap larger than `limit` is returned as any number above `limit`, or infinity.
     """
     return over_arenas(functools.partial(_look, poses, hull_radius, limit), scene)
 
@@ -49,7 +51,7 @@ def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, lim
 def _look(
     poses: Sequence[Sequence[float]], hull_radius: float, limit: float, scene: Scene
 ) -> Array:
-    """Looks around in many arenas, [A, K + 3, R, 2]."""
+    """Looks around from each robot of A arenas; returns [A, K + 3, R, 2] as `look` does."""
     pose, side, obstacle, turn, shades = scene
     (arenas, robots), rows = pose.shape[:2], len(poses) + len(KINDS)
     threads = min(rows, max(1, _THREADS // (arenas * robots)))
@@ -61,7 +63,7 @@ def _look(
 
 
 def _with_last(sensor: infrared.Ray, *last: float) -> Array:
-    """Joins the sensors and the last row of `WarpLook.sensor` into [A or 1, R or 1, K + 1, 4]."""
+    """Returns `WarpLook.sensor` [A or 1, R or 1, K + 1, 4]: all sensors, then the row `last`."""
     rows = jnp.stack(jnp.broadcast_arrays(*sensor), axis=-1)
     rows = rows.reshape(*(1, 1, *rows.shape)[-4:])
     row = np.broadcast_to(np.array([*last, 0.0], np.float32), (*rows.shape[:2], 1, 4))
@@ -69,7 +71,7 @@ def _with_last(sensor: infrared.Ray, *last: float) -> Array:
 
 
 def _shades(shades: infrared.Reflectance | None, pose: Array, obstacle: Array) -> Array:
-    """Returns reflectances of walls, boxes and robots, [A, 1 + M + R]; a single 1 for all ones."""
+    """Returns the reflectances [A, 1 + M + R] of walls, boxes and robots; [[1]] if all are 1."""
     if shades is None:
         return jnp.ones((1, 1))
     (arenas, robots), boxes = pose.shape[:2], obstacle.shape[1]
@@ -79,7 +81,7 @@ def _shades(shades: infrared.Reflectance | None, pose: Array, obstacle: Array) -
 
 
 def _cells(pose: Array, hull_radius: float, limit: float) -> tuple[Array, Array]:
-    """Puts robots into cells; a small swarm into a single one, the same in all arenas."""
+    """Puts robots into cells; all robots of a small swarm go into the same single cell."""
     robots = pose.shape[1]
     if robots > dispatch.MOST_COMPARED:
         return cells_warp.chain(pose, _SLACK * (hull_radius + limit) + hull_radius)
@@ -89,7 +91,7 @@ def _cells(pose: Array, hull_radius: float, limit: float) -> tuple[Array, Array]
 
 @wp.struct
 class WarpLook:
-    """One robot that looks around, and what it finds.
+    """What a thread needs to look around from one robot, and where it writes what it finds.
 
     Attributes:
       place: x (m), y (m), yaw (rad).
@@ -97,14 +99,14 @@ class WarpLook:
       sin: sine of the yaw.
       hull: radius of the hulls, m.
       reach: largest distance from the robot's centre at which a sensor sees a surface, m.
-      sensor: [K + 1] x (m) and y (m) in the robot's frame, cosine and sine of the yaw in this
-        frame. The last row is the radius of the hulls (m), the range (m), and the threads per
-        robot.
-      rays: K.
-      found: [K + 3, R] m, and reflectance.
+      sensor: [K + 1] the first K rows hold x (m), y (m), cosine and sine of the yaw of each sensor
+        in the robot's frame. The last row holds the radius of the hulls (m), the range of the
+        sensors (m), the number of threads per robot, and 0.
+      rays: K, number of rays.
+      found: [K + 3, R] distance to the nearest surface (m), and its reflectance; rows as in `look`.
       robot: index of the robot.
-      first: first row of the thread.
-      step: from a row of the thread to its next one.
+      first: first row of `found` that this thread computes.
+      step: distance between the rows that this thread computes.
     """
 
     place: wp.vec3
@@ -131,7 +133,7 @@ def _look_around(
     after: wp.array2d[int],
     found: wp.array3d[wp.vec2],
 ) -> None:
-    """Finds the nearest surface for each of the thread's rows of a robot."""
+    """Finds the nearest surface for each row of a robot that this thread computes."""
     i, thread, robot = wp.tid()
     look = WarpLook()
     look.place = place[i, robot]
@@ -166,7 +168,7 @@ def _look_around(
 
 @wp.func
 def _see_walls(look: WarpLook, half: float, limit: float, shade: float) -> None:
-    """Begins each row with the walls of the arena, as in `infrared.ray_walls`."""
+    """Sets each row to the distance to the walls of the arena, as `infrared.ray_walls` does."""
     for row in range(look.first, look.found.shape[0], look.step):
         look.found[row, look.robot] = wp.vec2(_MISS, 1.0)
         if row < look.rays:
@@ -183,7 +185,7 @@ def _see_walls(look: WarpLook, half: float, limit: float, shade: float) -> None:
 
 @wp.func
 def _see_robot(look: WarpLook, other: wp.vec3, shade: float) -> None:
-    """Looks at another robot."""
+    """Updates the thread's rows with the distances to another robot, if it is near enough."""
     x, y = other[0] - look.place[0], other[1] - look.place[1]
     apart = x * x + y * y
     if apart < (look.reach + look.hull) * (look.reach + look.hull):
@@ -196,7 +198,7 @@ def _see_robot(look: WarpLook, other: wp.vec3, shade: float) -> None:
 
 @wp.func
 def _see_box(look: WarpLook, obstacle: wp.array[float], shade: float) -> None:
-    """Looks at a box."""
+    """Updates the thread's rows with the distances to a box, if it is near enough."""
     x, y = look.place[0] - obstacle[0], look.place[1] - obstacle[1]
     far = look.reach + obstacle[3] + obstacle[4]  # more than the box's half diagonal
     if x * x + y * y < far * far:
@@ -215,7 +217,7 @@ def _see_box(look: WarpLook, obstacle: wp.array[float], shade: float) -> None:
 
 @wp.func
 def _see(look: WarpLook, row: int, distance: float, shade: float) -> None:
-    """Keeps the nearest surface of a row, and the brightest of several at the same distance."""
+    """Updates a row if a surface is nearer, or brighter at the same distance, than its own."""
     before = look.found[row, look.robot]
     if distance < before[0]:
         look.found[row, look.robot] = wp.vec2(distance, shade)
@@ -225,7 +227,7 @@ def _see(look: WarpLook, row: int, distance: float, shade: float) -> None:
 
 @wp.func
 def _ray(look: WarpLook, k: int) -> wp.vec4:
-    """Returns x and y of the origin of a ray, and of its unit direction."""
+    """Returns a ray in the world frame: x and y of its origin (m), x and y of its direction."""
     at = look.sensor[k]
     x, y = look.cos * at[0] - look.sin * at[1], look.sin * at[0] + look.cos * at[1]
     toward_x = look.cos * at[2] - look.sin * at[3]
@@ -235,7 +237,7 @@ def _ray(look: WarpLook, k: int) -> wp.vec4:
 
 @wp.func
 def _to_wall(at: float, toward: float, half: float) -> float:
-    """Returns the distance to the wall ahead, as in `infrared`."""
+    """Returns the distance to the wall ahead, as `infrared._to_wall` does."""
     return (half - wp.where(toward < 0.0, -at, at)) / wp.max(wp.abs(toward), 1.0e-9)
 
 
@@ -266,7 +268,7 @@ def _to_box(ray: wp.vec4, box: WarpBox) -> float:
 
 @wp.func
 def _cross(at: float, toward: float, half: float) -> wp.vec2:
-    """Returns where a ray enters and leaves the slab between two faces, as in `infrared`."""
+    """Returns where a ray enters and leaves the slab between two faces (`infrared._cross`)."""
     pace = 1.0 / wp.where(wp.abs(toward) < 1.0e-9, 1.0e-9, toward)
     first, second = (-half - at) * pace, (half - at) * pace
     return wp.vec2(wp.min(first, second), wp.max(first, second))

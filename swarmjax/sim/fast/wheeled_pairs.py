@@ -1,6 +1,6 @@
-"""Contacts between wheeled robots: a joint solution for robots that touch each other.
+"""Solves the contacts of wheeled robots that touch each other, together for all of them.
 
-`wheeled_warp` describes the problem, and first solves it for single robots.
+`wheeled_warp` describes the problem, and solves it for the robots that touch no other robot.
 """
 
 import warp as wp
@@ -8,8 +8,8 @@ import warp as wp
 from swarmjax.sim.fast import wheeled_problem as wheeled
 from swarmjax.sim.fast.wheeled_problem import Matrix, Problem, Together, Vector
 
-# Only one of SPREAD threads takes an arena. If all 32 threads of a warp read different places,
-# their reads take 32 turns.
+# One in SPREAD threads solves an arena, and the others do nothing. If all 32 threads of a CUDA warp
+# solved arenas, they would read from 32 different places, one after the other.
 SPREAD = wp.constant(4)
 
 
@@ -17,7 +17,7 @@ SPREAD = wp.constant(4)
 def relax_pairs(
     problem: Problem, together: Together, robots: int, iterations: int, niter: wp.array[int]
 ) -> None:
-    """Runs Newton's method for the robots of an arena that touch each other."""
+    """Runs Newton's method for those robots of an arena that touch another robot."""
     turn = wp.tid() / SPREAD
     if wp.tid() % SPREAD == 0 and turn < together.crowded[0]:
         arena = together.arena[turn]
@@ -36,7 +36,7 @@ def relax_pairs(
 
 @wp.func
 def _collect(problem: Problem, together: Together, arena: int, robots: int) -> None:
-    """Lists the rows between two robots."""
+    """Lists the rows of J that involve two robots."""
     count = wp.int32(0)
     for robot in range(robots):
         if problem.touches[arena, robot]:
@@ -50,7 +50,7 @@ def _collect(problem: Problem, together: Together, arena: int, robots: int) -> N
 
 @wp.func
 def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float]) -> float:
-    """Multiplies a row of J between two robots by values of their joints."""
+    """Multiplies a row of J that involves two robots by one value per joint of these robots."""
     first, second = problem.first[arena, row], problem.second[arena, row]
     total = _along_side(problem, arena, first, of_joints)
     return total + _along_side(problem, arena, second, of_joints)
@@ -60,14 +60,14 @@ def _along(problem: Problem, arena: int, row: int, of_joints: wp.array2d[float])
 def _along_side(
     problem: Problem, arena: int, side: wp.vec3i, of_joints: wp.array2d[float]
 ) -> float:
-    """Multiplies a row's entries for one robot by values of its joints."""
+    """Multiplies a row's entries for one robot by one value per joint of this robot."""
     entries = wheeled.entries_of(problem, arena, side)
     return wp.dot(entries, wheeled.of_robot(of_joints, arena, side[0]))
 
 
 @wp.func
 def _pick(problem: Problem, together: Together, arena: int) -> None:
-    """Finds the active rows between robots, and selects those that become separate terms."""
+    """Finds which rows between two robots are active, and which of them become separate terms."""
     taken = wp.int32(0)
     for k in range(together.count[arena]):
         row = together.row[arena, k]
@@ -83,7 +83,7 @@ def _pick(problem: Problem, together: Together, arena: int) -> None:
 
 @wp.func
 def _descend(problem: Problem, together: Together, arena: int, robot: int) -> None:
-    """Computes a robot's step without the separate terms, and the factor of its block."""
+    """Computes a robot's step without the separate terms, and its block's Cholesky factor."""
     wheeled.put_robot(together.step, arena, robot, Vector())
     if problem.touches[arena, robot]:
         hessian = wheeled.inertia_of(problem, arena, robot)
@@ -137,13 +137,13 @@ def _couple(problem: Problem, together: Together, arena: int) -> None:
 
 @wp.func
 def _side(problem: Problem, arena: int, row: int, side: int) -> wp.vec3i:
-    """Returns the `side` of the first or the second robot of a row, as for `entries_of`."""
+    """Returns the argument `side` of `entries_of` for the first or the second robot of a row."""
     return wp.where(side == 0, problem.first[arena, row], problem.second[arena, row])
 
 
 @wp.func
 def _overlap(problem: Problem, together: Together, arena: int, i: int, j: int, sides: int) -> float:
-    """Returns the effect of pair j along pair i, in the robot that `sides` picks in each pair."""
+    """Returns the effect of pair j along pair i through one robot, which `sides` picks in both."""
     row = together.pair[arena, i]
     mine = _side(problem, arena, row, sides % 2)
     theirs = _side(problem, arena, together.pair[arena, j], sides // 2)
@@ -219,7 +219,7 @@ def _length_together(problem: Problem, together: Together, arena: int, robots: i
 def _tilt_together(
     problem: Problem, together: Together, arena: int, robots: int, length: float
 ) -> wp.vec2:
-    """Returns first and second derivative of the cost of these robots' rows along the step."""
+    """Returns the first and second derivative of the cost of all these rows along the step."""
     tilt = wp.vec2()
     for k in range(together.count[arena]):
         tilt = tilt + _tilt_of(problem, together, arena, together.row[arena, k], length)
@@ -234,7 +234,7 @@ def _tilt_together(
 
 @wp.func
 def _tilt_of(problem: Problem, together: Together, arena: int, row: int, length: float) -> wp.vec2:
-    """Returns first and second derivative of a row's cost along the step."""
+    """Returns the first and second derivative of one row's cost along the step."""
     slope = together.slope[arena, row]
     push = wp.min(0.0, together.gap[arena, row] + length * slope)
     weight = wp.where(push < 0.0, problem.D[arena, row] * slope, 0.0)

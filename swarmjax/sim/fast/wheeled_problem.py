@@ -1,34 +1,36 @@
-"""The convex problem of wheeled robots' contacts, for `wheeled_warp` and `wheeled_pairs`.
+"""Arrays and functions of the contact problem of wheeled robots (see `wheeled_warp`).
 
-Loops over joints are unrolled, because a matrix stays in registers only then. Warp unrolls a loop
-if its bounds are constants or the counter of an enclosing loop. Functions get copies of arguments.
+Loops over joints have constant bounds, or a bound that is the counter of an enclosing loop. Warp
+unrolls such loops, and only then do matrices stay in registers. Functions get copies of their
+arguments, so a function that changes a matrix does not change its caller's matrix.
 """
 
 from typing import Any
 
 import warp as wp
 
-JOINTS = wp.constant(8)  # joints of a robot: six of a free body, and two wheels
-FREE = wp.constant(6)  # joints of the free body alone
+JOINTS = wp.constant(8)  # degrees of freedom of a robot: six of the free body, and two wheels
+FREE = wp.constant(6)  # degrees of freedom of the free body alone
 _INERTIA = wp.constant(35)  # entries of a robot's M, without the zero between both wheels
-SHARED = wp.constant(-2)  # stands in place of a wheel, in a row between two robots
-# Entries of `Problem.scaled` that follow a row's entries.
+SHARED = wp.constant(-2)  # third number of a `side` (see `entries_of`) in a row of two robots
+# Indices in `Problem.scaled` of the numbers that follow the eight entries of a row.
 AREF = wp.constant(8)
 GAP = wp.constant(9)
 SLOPE = wp.constant(10)
 _GEOMS = 5  # geoms of a robot: hull, two wheels, two skids
 SEARCHES = wp.constant(12)  # largest number of trials for a step's length
-# Slopes below this share of the initial slope count as zero. float32 rounds at 1e-7, and the grips
-# of a robot are 1e3 times as stiff as its mass.
+# In the search for a step's length, slopes of the cost below this share of the initial slope count
+# as zero. float32 rounds at 1e-7, and the cost of wheel contacts is 1e3 times as steep as that of
+# the robot's mass.
 FLAT = wp.constant(1e-4)
-# Shares of the acceleration. A step below `_SHORT` may be the last; a step below `_ROUNDING` is
-# only rounding.
+# Limits of a step's size, as shares of the acceleration. A step below `_SHORT` may be the last
+# step; a step below `_ROUNDING` is only rounding.
 _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
-# Number of contacts between robots that become separate terms. Further contacts are added to the
-# robots' blocks, and the method then takes more and shorter steps. Five robots have ten pairs;
-# larger swarms use MJX's own Newton method (`dispatch.MOST_WHEELED`). The number of contacts equals
-# JOINTS, so one size of matrix serves for both.
+# Largest number of contacts between robots that become separate terms. Further contacts are added
+# to the robots' blocks, so that the method needs more steps, which are shorter. Five robots have
+# ten pairs; larger swarms use MJX's own Newton method (`dispatch.MOST_WHEELED`). PAIRS equals
+# JOINTS, so that one type of matrix serves for both.
 PAIRS = wp.constant(8)
 
 
@@ -42,28 +44,31 @@ class Matrix(wp.types.matrix(shape=(JOINTS, JOINTS), dtype=wp.float32)):
 
 @wp.struct
 class Problem:
-    """The problem of all arenas.
+    """The contact problem of all arenas; a row is one row of the Jacobian, and of its arrays.
 
     Attributes:
-      force: [A, V] forces on the joints without contacts, M a0.
+      force: [A, V] sum of all forces on the joints except contact forces, M a0.
       qacc: [A, V] accelerations.
       M: [A, C] inertia matrices, `_INERTIA` entries per robot.
-      count: [A] rows of the Jacobian.
-      J: [A, 1, E] Jacobians; a row has `J_count` entries from `J_first` on, with descending joints.
-      J_first: [A, N].
-      J_count: [A, N].
-      J_column: [A, 1, E].
+      count: [A] number of rows of the Jacobian.
+      J: [A, 1, E] entries of the sparse Jacobians. A row has `J_count` entries from index `J_first`
+        on, from the last joint to the first.
+      J_first: [A, N] index of a row's first entry.
+      J_count: [A, N] number of a row's entries.
+      J_column: [A, 1, E] joint to which an entry belongs.
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
-      first: [A, N] the `side` (as for `entries_of`) of the robot with the higher number, for a row
-        between two robots.
-      second: [A, N] the `side` of the other robot.
-      own: [A, R] number of rows of a robot.
-      row: [A, R, K] indices of these rows, and where the robot's entries are in them.
-      touches: [A, R] whether any of the robot's rows also involves another robot.
-      scaled: [K, 11, A R] numbers of each row, multiplied by the root of D: the robot's entries and
-        aref, and during `_relax` also J a - aref and J times the step. Values that threads read at
-        the same time are adjacent.
+      first: [A, N] for a row of two robots, the argument `side` of `entries_of` for the robot with
+        the higher index.
+      second: [A, N] for a row of two robots, the argument `side` for the other robot.
+      own: [A, R] number of rows that involve a robot.
+      row: [A, R, K] the indices of these rows, and where the robot's entries are in them: the
+        argument `side` of `entries_of`, with the index of the row as its first number.
+      touches: [A, R] whether any of a robot's rows also involves another robot.
+      scaled: [K, 11, A R] eleven numbers of each row, multiplied by the square root of D: the
+        robot's eight entries and aref, and during `_relax_each` also J a - aref and J times the
+        step. The last axis is arena and robot, so that threads read adjacent values at the same
+        time.
     """
 
     force: wp.array2d[float]
@@ -86,21 +91,22 @@ class Problem:
 
 @wp.struct
 class Together:
-    """Work arrays for robots that touch each other.
+    """Work arrays for the joint solution of robots that touch each other.
 
     Attributes:
-      crowded: [1] number of arenas with such robots.
-      arena: [A] indices of these arenas.
-      count: [A] rows between two robots.
+      crowded: [1] number of arenas in which robots touch each other.
+      arena: [A] indices of these arenas; only the first `crowded` entries are used.
+      count: [A] number of rows that involve two robots.
       row: [A, N] indices of these rows.
-      step: [A, V] Newton's step; 0 for all other robots.
-      gap: [A, N] J a - aref; a row is active below 0.
-      slope: [A, N] J times the step.
+      step: [A, V] Newton's step; 0 for robots that touch no other robot.
+      gap: [A, N] J a - aref of a row; the row is active if this is negative.
+      slope: [A, N] a row's J times the step.
       slot: [A, N] index of a row's separate term; -1 for none.
       taken: [A] number of separate terms.
-      pair: [A, P] rows of the separate terms.
+      pair: [A, P] indices of the rows that are separate terms.
       factor: [A, R] Cholesky factor of a robot's block.
-      response: [A, P, 2] effect of a unit of a pair's contact force on either robot.
+      response: [A, P, 2] effect of a unit of a separate term's contact force on each of its two
+        robots.
     """
 
     crowded: wp.array[int]
@@ -118,7 +124,7 @@ class Together:
 
 
 def gather(m: Any, d: Any, robots: int) -> Any:
-    """Gathers the problem; its lists are filled in later."""
+    """Gathers the problem from Warp's model and data; `wheeled_warp` fills in the lists of rows."""
     problem = Problem()
     problem.force = wp.empty((d.nworld, m.nv), dtype=float)
     problem.qacc, problem.M = d.qacc, d.M
@@ -128,7 +134,8 @@ def gather(m: Any, d: Any, robots: int) -> Any:
     rows = d.nworld, d.njmax
     problem.first, problem.second = wp.empty(rows, dtype=wp.vec3i), wp.empty(rows, dtype=wp.vec3i)
     problem.own = wp.empty((d.nworld, robots), dtype=int)
-    # Most rows of a robot: 4 per wheel, 1 per skid, 1 per object near its hull (not the floor).
+    # Largest number of a robot's rows: 4 per wheel, 1 per skid, and 1 per object (other than the
+    # floor) that its hull may touch.
     others = m.ngeom - 1 - _GEOMS * robots
     most = 2 * 4 + 2 + robots - 1 + others
     problem.row = wp.empty((d.nworld, robots, most), dtype=wp.vec3i)
@@ -153,7 +160,7 @@ def make_room(m: Any, d: Any, robots: int) -> Any:
 
 @wp.func
 def does_switch(gap: float, slope: float) -> bool:
-    """Returns whether a row is active only before a whole step, or only after it.
+    """Returns whether a row becomes active or inactive in a whole step.
 
     If no row switches, the cost is quadratic along the step, and the whole step is best.
     """
@@ -162,16 +169,17 @@ def does_switch(gap: float, slope: float) -> bool:
 
 @wp.func
 def goes_on(moves: bool, step: float, acceleration: float) -> bool:
-    """Returns whether to continue.
+    """Returns whether Newton's method should take another step.
 
-    A long step leaves rounding errors. A tiny step is only rounding.
+    After a long step, another one is needed to remove rounding errors. A tiny step is only
+    rounding.
     """
     return (moves or step > _SHORT * acceleration) and step > _ROUNDING * acceleration
 
 
 @wp.func
 def of_robot(of_joints: wp.array2d[float], arena: int, robot: int) -> Vector:
-    """Returns the values of a robot's joints."""
+    """Returns the robot's eight values in an array that has one value per joint."""
     found = Vector()
     for i in range(8):
         found[i] = of_joints[arena, robot * JOINTS + i]
@@ -180,14 +188,14 @@ def of_robot(of_joints: wp.array2d[float], arena: int, robot: int) -> Vector:
 
 @wp.func
 def put_robot(of_joints: wp.array2d[float], arena: int, robot: int, numbers: Vector) -> None:
-    """Sets the values of a robot's joints."""
+    """Sets the robot's eight values in an array that has one value per joint."""
     for i in range(8):
         of_joints[arena, robot * JOINTS + i] = numbers[i]
 
 
 @wp.func
 def inertia_of(problem: Problem, arena: int, robot: int) -> Matrix:
-    """Returns the lower half of a robot's M; MuJoCo stores it row by row."""
+    """Returns the lower half of a robot's inertia matrix, which MuJoCo stores row by row."""
     found = Matrix()
     entry = robot * _INERTIA
     for i in range(6):
@@ -276,7 +284,7 @@ def substitute(lower: Matrix, right: Vector) -> Vector:
 
 @wp.func
 def narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
-    """Narrows a range of step lengths; returns its ends and the next trial (Newton or midpoint)."""
+    """Narrows a range of step lengths; returns its two ends and the next length to try."""
     low = wp.where(tilt < 0.0, search[2], search[0])
     high = wp.where(tilt < 0.0, search[1], search[2])
     there = search[2] - tilt / curve

@@ -1,17 +1,18 @@
-"""Contacts of the wheeled body in MJX-Warp: Newton's method with one thread per robot.
+"""Solves the contacts of the wheeled body in MJX-Warp, by Newton's method per robot.
 
-MJX calls Warp's `step` by name, and this module replaces that function. The model's `opt.solver`
-selects the step: `NUMBER` selects the one made for wheels, all other values MJX-Warp's own.
+MJX looks up the function `step` of MJX-Warp by name, and this module replaces that function. The
+model's `opt.solver` selects what the new function does: `NUMBER` selects the step made for wheels,
+and any other value selects MJX-Warp's own step.
 
 MuJoCo solves a convex problem for the accelerations a (MuJoCo's documentation, Computation, "Primal
-problem"), with rows for pyramidal friction cones and for contacts that only push,
+problem"), where each index i is a row of the Jacobian J, for an edge of a pyramidal friction cone
+or for a contact without friction:
 
     minimise  1/2 (a - a0)' M (a - a0) + sum_i D_i / 2 min(0, J_i a - aref_i)^2.
 
-For robots that touch only the floor, walls and obstacles, the rows of M and J involve one robot
-each. The problem then splits into one problem with 8 unknowns per robot. MJX-Warp's Newton method
-instead solves for all robots of an arena together, and factorises a matrix of 8 R rows per
-iteration.
+If robots touch only the floor, walls and obstacles, each row of M and J involves one robot. The
+problem then splits into one problem per robot, with 8 unknowns. MJX-Warp's Newton method instead
+solves for all robots of an arena together, and factorises a matrix of 8 R rows per iteration.
 
 Here, only robots that touch each other are solved together. Their Hessian is one 8 x 8 block per
 robot, plus a rank-one term per contact between two robots. The Woodbury identity moves these terms
@@ -33,9 +34,9 @@ from swarmjax.sim.fast import wheeled_problem as wheeled
 from swarmjax.sim.fast.wheeled_pairs import SPREAD, relax_pairs
 from swarmjax.sim.fast.wheeled_problem import Problem, Together, Vector
 
-NUMBER = -1  # value of `opt.solver` for this solver; MuJoCo does not use it
-_ITERATIONS = 20  # limit of Newton's method; touching robots usually need six, at most 18 so far
-_BLOCK = 64  # threads per block; a thread's work is long and uneven, so small blocks wait less
+NUMBER = -1  # value of `opt.solver` that selects this solver; MuJoCo does not use this value
+_ITERATIONS = 20  # limit of Newton's iterations; touching robots usually take 6, at most 18 so far
+_BLOCK = 64  # threads per block; small, since blocks wait for their slowest thread
 
 
 _mjx_step = mjw.step
@@ -70,9 +71,10 @@ def _step(m: Any, d: Any) -> None:
 def _step_wheels(m: Any, d: Any) -> None:
     """Advances all arenas of wheeled robots by one physics step (MuJoCo's semi-implicit Euler).
 
-    The step ignores the external forces `xfrc_applied`, since nothing here uses them. `m` is Warp's
-    model: only robots, with eight joints each; a sparse Jacobian. `d` is Warp's data of all arenas,
-    modified in place, except for the contact forces.
+    The step ignores the external forces `xfrc_applied`, since swarmjax does not use them. `m` is
+    Warp's model, in which all joints belong to robots of eight degrees of freedom and the Jacobian
+    is sparse. `d` is Warp's data of all arenas; it is modified in place, but contact forces are not
+    written.
     """
     mjw.fwd_position(m, d, factorize=False)
     mjw.fwd_velocity(m, d)
@@ -101,7 +103,7 @@ def _begin(
     actuator: wp.array2d[float],
     warmstart: wp.array2d[float],
 ) -> None:
-    """Sums the forces on a joint, and starts from the previous step's acceleration."""
+    """Sums the forces on a joint, and sets its acceleration to that of the previous step."""
     arena, dof = wp.tid()
     given = applied[arena, dof] - bias[arena, dof]
     problem.force[arena, dof] = given + passive[arena, dof] + actuator[arena, dof]
@@ -110,14 +112,14 @@ def _begin(
 
 @wp.kernel(enable_backward=False)
 def _share_out(problem: Problem, together: Together) -> None:
-    """Lists the rows of a robot.
+    """Lists the rows that involve a robot.
 
-    The thread of the first robot also lists the arena if any robots touch each other.
+    If any robots of the arena touch each other, the thread of the first robot also lists the arena.
     """
     arena, robot = wp.tid()
     own = wp.int32(0)
     touches, crowded = wp.bool(False), wp.bool(False)
-    # Rows beyond the memory's size are left out.
+    # Rows for which there is no memory are left out.
     for row in range(wp.min(problem.count[arena], problem.first.shape[1])):
         first, second = _sides(problem, arena, row)
         if robot == first[0] and second[0] >= 0:
@@ -137,10 +139,10 @@ def _share_out(problem: Problem, together: Together) -> None:
 
 @wp.func
 def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
-    """Returns the `side` of a row's robots, as for `entries_of`; the higher number comes first.
+    """Returns a row's arguments `side` for `entries_of`; the robot with the higher index is first.
 
-    A row has the six entries of a body. A wheel's row has the wheel's entry before them. A row of
-    two robots has twelve entries.
+    A row has six entries for a robot's free body. The row of a wheel's contact has one more entry
+    before these, for the wheel. A row of two robots has twelve entries.
     """
     first = problem.J_first[arena, row]
     joint = problem.J_column[arena, 0, first]
@@ -158,7 +160,7 @@ def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
 
 @wp.func
 def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
-    """Copies a robot's row so that neighbouring threads read from adjacent memory."""
+    """Copies a robot's row to `scaled`, where neighbouring threads read from adjacent memory."""
     side = problem.row[arena, robot, k]
     root = wp.sqrt(problem.D[arena, side[0]])
     entries = root * wheeled.entries_of(problem, arena, side)
@@ -175,7 +177,7 @@ def _relax_each(problem: Problem, iterations: int) -> None:
     if problem.touches[arena, robot]:
         return
     lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
-    # Copy here, not where rows are listed: there, neighbouring threads would copy one by one.
+    # Copy rows here and not in `_share_out`: there, neighbouring threads would copy one by one.
     for k in range(own):
         _scale(problem, arena, robot, k)
     now = wheeled.of_robot(problem.qacc, arena, robot)
@@ -199,7 +201,7 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 
 @wp.func
 def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
-    """Returns Newton's step for the rows that are active now."""
+    """Returns Newton's step for the rows that are active at the accelerations `now`."""
     lane = arena * problem.own.shape[1] + robot
     hessian = wheeled.inertia_of(problem, arena, robot)
     uphill = wheeled.times(hessian, now) - wheeled.of_robot(problem.force, arena, robot)
@@ -215,7 +217,7 @@ def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
 
 @wp.func
 def _scaled(problem: Problem, k: int, lane: int) -> Vector:
-    """Returns a robot's entries in one of its rows, times the root of D."""
+    """Returns a robot's entries in one of its rows, times the square root of D."""
     found = Vector()
     for i in range(8):
         found[i] = problem.scaled[k, i, lane]
@@ -241,7 +243,7 @@ def _length(problem: Problem, arena: int, robot: int, now: Vector, downhill: Vec
 
 @wp.func
 def _tilt(problem: Problem, arena: int, robot: int, length: float) -> wp.vec2:
-    """Returns first and second derivative of the rows' cost along a step."""
+    """Returns the first and second derivative of the cost of a robot's rows along a step."""
     lane = arena * problem.own.shape[1] + robot
     tilt = wp.vec2()
     for k in range(problem.own[arena, robot]):
