@@ -133,7 +133,7 @@ def test_import_needs_neither_jax_nor_hydra():
         (["robots=3"], "robots is not a key: did you mean stage.robots?"),
         (["name=s3"], "name is not a key: did you mean run.dir or stage.name?"),
         (["learning_rate=1"], "learning_rate is not a key: did you mean "
-         "algo.critic_learning_rate?"),
+         "algo.actor_learning_rate?"),
         # Words of other tools.
         *(([f"{word}=1"], f"{word} is not a key: did you mean run.dir?")
           for word in ("out", "dir", "output", "folder", "logdir", "save")),
