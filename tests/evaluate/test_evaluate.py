@@ -226,7 +226,7 @@ def test_the_command_writes_the_result_and_prints_a_table(
     printed = capsys.readouterr()
     row = next(line for line in printed.out.splitlines() if "targets reached, %" in line)
     assert f"{100 * cell['measures']['targets_reached']['mean']:.1f}" in row.split()
-    assert f"{path} on s1, 3 episodes" in " ".join(printed.out.split())  # a long path breaks it
+    assert f"{path.name} on s1, 3 episodes" in printed.out  # a long path loses its beginning
     assert "\x1b" not in printed.out  # no colours, since the output is not a terminal
     assert printed.err == ""
 

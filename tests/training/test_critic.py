@@ -293,5 +293,5 @@ def test_a_network_that_takes_the_observation_alone_is_refused() -> None:
     own = [Network(name="fixed", function=Fixed)]
     config = replace(CONFIG, network="fixed")
     assert networks.make(config, Sizes(SIZE, 2), own).actor.torso is Fixed
-    with pytest.raises(ConfigError, match="network fixed turns"):
+    with pytest.raises(ConfigError, match="network fixed returns"):
         networks.make(config, Sizes(SIZE, 2, STATE), own)
