@@ -37,9 +37,9 @@ _MOST_SWEEPS = 200
 # get as close to MuJoCo C as a jam without friction. With `jax`, hulls with friction get the same
 # limits of MJX's Newton method as the wheeled body.
 _MOST_RUBBING_SWEEPS = 400
-# Largest number of wheeled robots that the solver made for wheels handles. In a jam of 10 to 20 of
-# them, it would leave an error of up to 7 mm/s.
-MOST_WHEELED = 5
+# Largest number of wheeled robots that the solver made for wheels handles. Each robot looks through
+# all rows of its arena, which takes too long in larger swarms.
+MOST_WHEELED = 64
 MOST_PIECES = 16  # most objects that `pieces` splits; each piece makes the program longer
 MOST_COMPARED = 100  # up to this number of robots, all pairs are compared
 _UNROLLED = 8  # objects per iteration of an unrolled loop; 4 and 16 were no faster

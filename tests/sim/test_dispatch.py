@@ -30,12 +30,12 @@ def test_auto_is_jax_without_an_nvidia_gpu() -> None:
 def test_the_solver_is_chosen() -> None:
     resolve = dispatch.resolve_solver
     assert resolve("auto", "warp", "planar", 50) == "swarm"
-    assert resolve("auto", "warp", "wheeled", 5) == "swarm"
-    assert resolve("auto", "warp", "wheeled", 6) == "mjx"
+    assert resolve("auto", "warp", "wheeled", 64) == "swarm"
+    assert resolve("auto", "warp", "wheeled", 65) == "mjx"
     assert resolve("auto", "jax", "planar", 50) == "swarm"
     assert resolve("auto", "jax", "wheeled", 5) == "mjx"
     assert resolve("mjx", "warp", "planar", 5) == "mjx"
-    for impl, robots in (("jax", 5), ("warp", 6)):
+    for impl, robots in (("jax", 5), ("warp", 65)):
         with pytest.raises(
             ConfigError, match=r"robot\.body is wheeled: give sim\.solver=mjx or auto, or"
         ):
@@ -46,7 +46,7 @@ def test_hulls_that_rub_are_solved_where_the_solver_knows_friction() -> None:
     resolve = partial(dispatch.resolve_solver, rubs=True)
     assert resolve("auto", "warp", "planar", 5) == resolve("auto", "jax", "planar", 5) == "swarm"
     assert resolve("auto", "warp", "wheeled", 5) == "mjx"
-    with pytest.raises(ConfigError, match=r"at most 5 robots and without robot\.hull_friction"):
+    with pytest.raises(ConfigError, match=r"at most 64 robots and without robot\.hull_friction"):
         resolve("swarm", "warp", "wheeled", 5)
 
 

@@ -27,11 +27,6 @@ FLAT = wp.constant(1e-4)
 # step; a step below `_ROUNDING` is only rounding.
 _SHORT = wp.constant(1e-2)
 _ROUNDING = wp.constant(1e-5)
-# Largest number of contacts between robots that become separate terms. Further contacts are added
-# to the robots' blocks, so that the method needs more steps, which are shorter. Five robots have
-# ten pairs; larger swarms use MJX's own Newton method (`dispatch.MOST_WHEELED`). PAIRS equals
-# JOINTS, so that one type of matrix serves for both.
-PAIRS = wp.constant(8)
 
 
 class Vector(wp.types.vector(length=JOINTS, dtype=wp.float32)):
@@ -58,15 +53,15 @@ class Problem:
       J_column: [A, 1, E] joint to which an entry belongs.
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
-      first: [A, N] for a row of two robots, the argument `side` of `entries_of` for the robot with
-        the higher index.
-      second: [A, N] for a row of two robots, the argument `side` for the other robot.
+      first: [A, N] the argument `side` of `entries_of` for a row's robot, or for the robot with the
+        higher index of two.
+      second: [A, N] the argument `side` for the other robot; -1 for none.
       own: [A, R] number of rows that involve a robot.
       row: [A, R, K] the indices of these rows, and where the robot's entries are in them: the
         argument `side` of `entries_of`, with the index of the row as its first number.
       touches: [A, R] whether any of a robot's rows also involves another robot.
       scaled: [K, 11, A R] eleven numbers of each row, multiplied by the square root of D: the
-        robot's eight entries and aref, and during `_relax_each` also J a - aref and J times the
+        robot's eight entries and aref, and in Newton's method also J a - aref and J times the
         step. The last axis is arena and robot, so that threads read adjacent values at the same
         time.
     """
@@ -96,31 +91,20 @@ class Together:
     Attributes:
       crowded: [1] number of arenas in which robots touch each other.
       arena: [A] indices of these arenas; only the first `crowded` entries are used.
-      count: [A] number of rows that involve two robots.
-      row: [A, N] indices of these rows.
       step: [A, V] Newton's step; 0 for robots that touch no other robot.
-      gap: [A, N] J a - aref of a row; the row is active if this is negative.
-      slope: [A, N] a row's J times the step.
-      slot: [A, N] index of a row's separate term; -1 for none.
-      taken: [A] number of separate terms.
-      pair: [A, P] indices of the rows that are separate terms.
+      rest: [A, V] what the step leaves of the cost's slope.
+      way: [A, V] direction of the next step of conjugate gradients.
+      bend: [A, V] the Hessian times `way`; then `rest` divided by the robots' blocks.
       factor: [A, R] Cholesky factor of a robot's block.
-      response: [A, P, 2] effect of a unit of a separate term's contact force on each of its two
-        robots.
     """
 
     crowded: wp.array[int]
     arena: wp.array[int]
-    count: wp.array[int]
-    row: wp.array2d[int]
     step: wp.array2d[float]
-    gap: wp.array2d[float]
-    slope: wp.array2d[float]
-    slot: wp.array2d[int]
-    taken: wp.array[int]
-    pair: wp.array2d[int]
+    rest: wp.array2d[float]
+    way: wp.array2d[float]
+    bend: wp.array2d[float]
     factor: wp.array2d[Matrix]
-    response: wp.array3d[Vector]
 
 
 def gather(m: Any, d: Any, robots: int) -> Any:
@@ -146,15 +130,11 @@ def gather(m: Any, d: Any, robots: int) -> Any:
 
 def make_room(m: Any, d: Any, robots: int) -> Any:
     """Allocates the work arrays for robots that touch each other."""
-    arenas, rows, together = d.nworld, (d.nworld, d.njmax), Together()
-    together.crowded = wp.empty(1, dtype=int)
-    together.arena, together.count, together.taken = (wp.empty(arenas, dtype=int) for _ in range(3))
-    together.row, together.slot = wp.empty(rows, dtype=int), wp.empty(rows, dtype=int)
-    together.gap, together.slope = wp.empty(rows, dtype=float), wp.empty(rows, dtype=float)
-    together.step = wp.empty((arenas, m.nv), dtype=float)
-    together.pair = wp.empty((arenas, PAIRS), dtype=int)
-    together.factor = wp.empty((arenas, robots), dtype=Matrix)
-    together.response = wp.empty((arenas, PAIRS, 2), dtype=Vector)
+    together, joints = Together(), (d.nworld, m.nv)
+    together.crowded, together.arena = wp.empty(1, dtype=int), wp.empty(d.nworld, dtype=int)
+    together.step, together.rest = wp.empty(joints, dtype=float), wp.empty(joints, dtype=float)
+    together.way, together.bend = wp.empty(joints, dtype=float), wp.empty(joints, dtype=float)
+    together.factor = wp.empty((d.nworld, robots), dtype=Matrix)
     return together
 
 
@@ -289,3 +269,20 @@ def narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
     high = wp.where(tilt < 0.0, search[1], search[2])
     there = search[2] - tilt / curve
     return wp.vec3(low, high, wp.where(low < there and there < high, there, 0.5 * (low + high)))
+
+
+@wp.func
+def scaled(problem: Problem, k: int, lane: int) -> Vector:
+    """Returns a robot's entries in one of its rows, times the square root of D."""
+    found = Vector()
+    for i in range(8):
+        found[i] = problem.scaled[k, i, lane]
+    return found
+
+
+@wp.func
+def tilt_of(problem: Problem, k: int, lane: int, length: float) -> wp.vec2:
+    """Returns the first and second derivative of the cost of a robot's row along a step."""
+    slope = problem.scaled[k, SLOPE, lane]
+    there = wp.min(0.0, problem.scaled[k, GAP, lane] + length * slope)
+    return slope * wp.vec2(there, wp.where(there < 0.0, slope, 0.0))

@@ -14,9 +14,7 @@ If robots touch only the floor, walls and obstacles, each row of M and J involve
 problem then splits into one problem per robot, with 8 unknowns. MJX-Warp's Newton method instead
 solves for all robots of an arena together, and factorises a matrix of 8 R rows per iteration.
 
-Here, only robots that touch each other are solved together. Their Hessian is one 8 x 8 block per
-robot, plus a rank-one term per contact between two robots. The Woodbury identity moves these terms
-out of the inverse (Golub and Van Loan 2013, "Matrix Computations", 2.1.4).
+Here, only robots that touch each other are solved together (`wheeled_pairs`).
 """
 
 import copy
@@ -31,7 +29,7 @@ from mujoco.mjx.warp import forward
 from swarmjax.sim import engine
 from swarmjax.sim.engine import Engine
 from swarmjax.sim.fast import wheeled_problem as wheeled
-from swarmjax.sim.fast.wheeled_pairs import SPREAD, relax_pairs
+from swarmjax.sim.fast.wheeled_pairs import MOST_THREADS, relax_pairs
 from swarmjax.sim.fast.wheeled_problem import Problem, Together, Vector
 
 NUMBER = -1  # value of `opt.solver` that selects this solver; MuJoCo does not use this value
@@ -86,11 +84,13 @@ def _step_wheels(m: Any, d: Any) -> None:
     wp.launch(_begin, dim=(d.nworld, m.nv), inputs=[problem, *forces])
     together.crowded.zero_()
     d.solver_niter.zero_()
+    wp.launch(_find_sides, dim=(d.nworld, d.njmax), inputs=[problem])
     wp.launch(_share_out, dim=(d.nworld, robots), inputs=[problem, together])
     most = min(m.opt.iterations, _ITERATIONS)
     wp.launch(_relax_each, dim=(d.nworld, robots), inputs=[problem, most], block_dim=_BLOCK)
-    inputs = [problem, together, robots, most, d.solver_niter]
-    wp.launch(relax_pairs, dim=d.nworld * SPREAD, inputs=inputs, block_dim=_BLOCK)
+    threads = min(MOST_THREADS, 2 ** (robots - 1).bit_length()) if d.qpos.device.is_cuda else 1
+    inputs = [problem, together, most, threads, d.solver_niter]
+    wp.launch(relax_pairs, dim=(d.nworld, threads), inputs=inputs, block_dim=_BLOCK)
     mjw.euler(m, d)
 
 
@@ -111,39 +111,15 @@ def _begin(
 
 
 @wp.kernel(enable_backward=False)
-def _share_out(problem: Problem, together: Together) -> None:
-    """Lists the rows that involve a robot.
-
-    If any robots of the arena touch each other, the thread of the first robot also lists the arena.
-    """
-    arena, robot = wp.tid()
-    own = wp.int32(0)
-    touches, crowded = wp.bool(False), wp.bool(False)
-    # Rows for which there is no memory are left out.
-    for row in range(wp.min(problem.count[arena], problem.first.shape[1])):
-        first, second = _sides(problem, arena, row)
-        if robot == first[0] and second[0] >= 0:
-            problem.first[arena, row] = first
-            problem.second[arena, row] = second
-        side = wp.where(robot == first[0], first, second)
-        if robot == side[0]:
-            problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
-            own += 1
-            touches = touches or second[0] >= 0
-        crowded = crowded or second[0] >= 0
-    problem.own[arena, robot] = own
-    problem.touches[arena, robot] = touches
-    if crowded and robot == 0:
-        together.arena[wp.atomic_add(together.crowded, 0, 1)] = arena
-
-
-@wp.func
-def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
-    """Returns a row's arguments `side` for `entries_of`; the robot with the higher index is first.
+def _find_sides(problem: Problem) -> None:
+    """Finds where the entries of a row's robots are; the robot with the higher index is first.
 
     A row has six entries for a robot's free body. The row of a wheel's contact has one more entry
     before these, for the wheel. A row of two robots has twelve entries.
     """
+    arena, row = wp.tid()
+    if row >= problem.count[arena]:
+        return
     first = problem.J_first[arena, row]
     joint = problem.J_column[arena, 0, first]
     robot, wheel = joint / wheeled.JOINTS, joint % wheeled.JOINTS
@@ -155,7 +131,32 @@ def _sides(problem: Problem, arena: int, row: int) -> tuple[wp.vec3i, wp.vec3i]:
         body = first + wheeled.FREE
         mine = wp.vec3i(robot, first, wheeled.SHARED)
         other = wp.vec3i(problem.J_column[arena, 0, body] / wheeled.JOINTS, body, wheeled.SHARED)
-    return mine, other
+    problem.first[arena, row] = mine
+    problem.second[arena, row] = other
+
+
+@wp.kernel(enable_backward=False)
+def _share_out(problem: Problem, together: Together) -> None:
+    """Lists the rows that involve a robot.
+
+    If any robots of the arena touch each other, the thread of the first robot also lists the arena.
+    """
+    arena, robot = wp.tid()
+    own = wp.int32(0)
+    touches, crowded = wp.bool(False), wp.bool(False)
+    # Rows for which there is no memory are left out.
+    for row in range(wp.min(problem.count[arena], problem.first.shape[1])):
+        first, second = problem.first[arena, row], problem.second[arena, row]
+        side = wp.where(robot == first[0], first, second)
+        if robot == side[0]:
+            problem.row[arena, robot, own] = wp.vec3i(row, side[1], side[2])
+            own += 1
+            touches = touches or second[0] >= 0
+        crowded = crowded or second[0] >= 0
+    problem.own[arena, robot] = own
+    problem.touches[arena, robot] = touches
+    if crowded and robot == 0:
+        together.arena[wp.atomic_add(together.crowded, 0, 1)] = arena
 
 
 @wp.func
@@ -174,12 +175,12 @@ def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
 def _relax_each(problem: Problem, iterations: int) -> None:
     """Runs Newton's method for a robot that touches no other robot."""
     arena, robot = wp.tid()
-    if problem.touches[arena, robot]:
-        return
     lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
     # Copy rows here and not in `_share_out`: there, neighbouring threads would copy one by one.
     for k in range(own):
         _scale(problem, arena, robot, k)
+    if problem.touches[arena, robot]:
+        return
     now = wheeled.of_robot(problem.qacc, arena, robot)
     done = wp.int32(0)
     moves = wp.bool(True)
@@ -187,7 +188,7 @@ def _relax_each(problem: Problem, iterations: int) -> None:
         downhill = _newton(problem, arena, robot, now)
         moves = wp.bool(False)
         for k in range(own):
-            slope = wp.dot(_scaled(problem, k, lane), downhill)
+            slope = wp.dot(wheeled.scaled(problem, k, lane), downhill)
             problem.scaled[k, wheeled.SLOPE, lane] = slope
             moves = moves or wheeled.does_switch(problem.scaled[k, wheeled.GAP, lane], slope)
         length = wp.float32(1.0)
@@ -206,22 +207,13 @@ def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
     hessian = wheeled.inertia_of(problem, arena, robot)
     uphill = wheeled.times(hessian, now) - wheeled.of_robot(problem.force, arena, robot)
     for k in range(problem.own[arena, robot]):
-        row = _scaled(problem, k, lane)
+        row = wheeled.scaled(problem, k, lane)
         gap = wp.dot(row, now) - problem.scaled[k, wheeled.AREF, lane]
         problem.scaled[k, wheeled.GAP, lane] = gap
         if gap < 0.0:
             uphill = uphill + gap * row
             hessian = wheeled.add(hessian, row, row)
     return wheeled.substitute(wheeled.factor_of(hessian), -uphill)
-
-
-@wp.func
-def _scaled(problem: Problem, k: int, lane: int) -> Vector:
-    """Returns a robot's entries in one of its rows, times the square root of D."""
-    found = Vector()
-    for i in range(8):
-        found[i] = problem.scaled[k, i, lane]
-    return found
 
 
 @wp.func
@@ -247,8 +239,5 @@ def _tilt(problem: Problem, arena: int, robot: int, length: float) -> wp.vec2:
     lane = arena * problem.own.shape[1] + robot
     tilt = wp.vec2()
     for k in range(problem.own[arena, robot]):
-        slope = problem.scaled[k, wheeled.SLOPE, lane]
-        there = problem.scaled[k, wheeled.GAP, lane] + length * slope
-        if there < 0.0:
-            tilt = tilt + slope * wp.vec2(there, slope)
+        tilt = tilt + wheeled.tilt_of(problem, k, lane, length)
     return tilt
