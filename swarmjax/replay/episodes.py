@@ -74,7 +74,7 @@ def _judge(
     if found:
         say(f"Takes the results of {episodes} from {found[0]}, where evaluate stored them.")
         return found[1]
-    say(f"Judges {episodes}: found no such evaluation beside the policy or the page.")
+    say(f"Evaluates {episodes}. To reuse results, give `out=` to evaluate (docs/replay.md).")
     report = partial(progress.advance, progress.add_task("episodes", total=count))
     return list(evaluate_trials.run(settings.evaluation, suite.cells, [entrant], report))
 

@@ -4,6 +4,7 @@ The runs differ in lightness and in the style of their lines, so they can also b
 print.
 """
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -97,5 +98,6 @@ def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping
 def _label(line: TableLine) -> str:
     """Labels a curve with the settings, the number of seeds and the directories of its runs."""
     place, seeds = table.cells(line)[-1], words.count(len(line.seeds), "seed")
-    label = f"{line.settings[:_LONGEST]} ({seeds}, {place[-_LONGEST:]})".lstrip()
+    settings = textwrap.shorten(line.settings, _LONGEST, placeholder=" ...")
+    label = f"{settings} ({seeds}, {words.shorten(place, _LONGEST)})".lstrip()
     return label.replace("$", r"\$")  # else two of them would begin a formula

@@ -63,7 +63,7 @@ def test_it_says_that_it_judges(tmp_path, capsys):
     path = steering.write(tmp_path / "steer.npz")
     words = [word for word in WORDS if "friction" not in word]
     assert replay.main([f"policy={path}", *words, "worst=2", f"out={tmp_path / 'a.html'}"]) == 0
-    said = "Judges 6 episodes: found no such evaluation beside the policy or the page."
+    said = "Evaluates 6 episodes. To reuse results, give `out=` to evaluate (docs/replay.md)."
     assert said in capsys.readouterr().err
 
 
