@@ -1,6 +1,6 @@
 """Defines your own pieces: a reward term, an observation, a drawing of levels and a network.
 
-Train with them, and judge the policy:
+Train with them, and evaluate the policy:
 
     python -m swarmjax.train extensions=examples/own_pieces.py stage=examples/ring.yaml
     python -m swarmjax.evaluate policy=runs/NAME/policy.npz extensions=examples/own_pieces.py
@@ -45,7 +45,7 @@ def ring(level: Level, key: jax.Array) -> Level:
 
 @network
 class Residual(nn.Module):
-    """Two layers; the second one has a skip connection."""
+    """Two layers, the second with a skip connection."""
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:

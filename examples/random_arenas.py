@@ -1,4 +1,4 @@
-"""Steps 64 arenas with random actions and draws one arena's paths: python random_arenas.py."""
+"""Steps 64 arenas with random actions and plots the paths in one: python random_arenas.py."""
 
 import jax
 import matplotlib.pyplot as plt
@@ -13,7 +13,7 @@ env = swarmjax.make_env("s6", arenas=64)
 
 
 def step(state: SwarmState, key: Array) -> tuple:
-    """Moves every robot with a random action; keeps poses and rewards."""
+    """Moves every robot with a random action; returns poses and rewards."""
     action = jax.random.uniform(key, (64, env.num_robots, 2), minval=-1.0)
     state, came = env.step(state, action)
     return state, (env.pose(state), came.reward)

@@ -1,6 +1,6 @@
 """Trains s1 with a small PPO in PyTorch until 90 % of targets are reached: python torch_ppo.py.
 
-All robots share the policy. An argument limits the number of updates. It needs the extra `torch`.
+All robots share the policy. An argument limits the number of updates. Install the extra `torch`.
 """
 
 import sys
@@ -18,7 +18,7 @@ TARGET = 0.9
 
 
 class ActorCritic(nn.Module):
-    """A Gaussian policy and a value; both normalise the observations with running statistics."""
+    """A Gaussian policy and a value function; running statistics normalise their observations."""
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class ActorCritic(nn.Module):
 
 @torch.no_grad()
 def collect(env: SwarmTorchEnv, model: ActorCritic, seen: Tensor) -> tuple[dict, Tensor]:
-    """Drives all robots for STEPS control steps; returns [T, N, ...] and the next observation."""
+    """Steps all robots STEPS times; returns transitions [T, N, ...] and the next observation."""
     rows = []
     for _ in range(STEPS):
         policy, value = model(seen)
@@ -81,7 +81,7 @@ def update(model: ActorCritic, optimizer: torch.optim.Optimizer, batch: dict) ->
             loss.backward()
             nn.utils.clip_grad_norm_(model.parameters(), 0.5)
             optimizer.step()
-    model.norm.train()(flat["seen"])  # last: ratios use the policy that acted
+    model.norm.train()(flat["seen"])  # last, since ratios need the policy that acted
     model.norm.eval()
 
 
@@ -92,7 +92,7 @@ def train(updates: int) -> tuple[float, int, float]:
       This share, robot steps, and seconds without the first step, which compiles.
     """
     torch.manual_seed(0)
-    torch.set_num_threads(1)  # for small networks more threads are slower, next to JAX's
+    torch.set_num_threads(1)  # with small networks, more threads are slower beside JAX's
     env = SwarmTorchEnv(swarmjax.make_env("s1", arenas=ARENAS))
     seen = env.reset(seed=0)
     model = ActorCritic(seen.shape[1]).eval()

@@ -1,4 +1,4 @@
-"""Trains with your own pieces and judges the policy: python train_own_pieces.py."""
+"""Trains with your own pieces and evaluates the policy: python train_own_pieces.py."""
 
 import sys
 from pathlib import Path
