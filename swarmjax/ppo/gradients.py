@@ -21,7 +21,7 @@ Metrics = dict[str, jax.Array]
 Progress = tuple[Params, optax.OptState]
 
 # Weight of the bound term. With a weight of 1, robots that blocked each other did so for ever
-# (docs/results.md, "The mean action was worse because the bound was too weak").
+# (docs/results.md, "Why more training made the swarm worse").
 BOUND_COST = 1500.0
 # Weight of the guess term, the error of the actor's guess of the state that the critic sees. Five
 # policies trained with this term solved 98.1 % of the levels of `worlds`; policies trained without

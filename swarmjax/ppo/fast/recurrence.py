@@ -24,7 +24,7 @@ from swarmjax.ppo.fast.kernel import logistic
 # of the chip's processors a program, and is faster on an H100. With more sequences, the backward
 # pass is faster with the larger tile. Several seeds side by side fill the chip with fewer sequences
 # of each; that was not timed. In the backward pass, 8 warps took twice as long with tiles of 64
-# sequences. With tiles of 32 sequences, 4 warps were slower than 8 (docs/performance.md).
+# sequences. With tiles of 32 sequences, 4 warps were slower than 8.
 SMALL_TILE, TILE = 16, 32
 MOST_SMALL = 8192
 _WARPS, _BACKWARD_WARPS = 4, 8

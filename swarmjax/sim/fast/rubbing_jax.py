@@ -34,7 +34,7 @@ from swarmjax.sim.fast import planar_jax
 from swarmjax.sim.fast.discs import TOLERANCE, DiscRobots, Discs, spring
 from swarmjax.sim.fast.planar_jax import DiscGap, Motion, against, against_row, of_others
 
-KEPT = 3  # sweeps that a leap uses; a fourth would save only 3 % in stage s6 (docs/performance.md)
+KEPT = 3  # sweeps that a leap uses; a fourth would save only 3 % in stage s6
 # Relative increase of a sum of squares that is used as a divisor. Without it, rounding could make
 # the divisor 0. The increase is ten times float32's rounding.
 ROUNDING = 1e-6
