@@ -116,7 +116,7 @@ def closing(settings: TrainConfig, run: Path, update: int, *, ended: bool) -> st
     if update < settings.updates:
         goal = f"run.stop_at={show(settings.run.stop_at)}"
         why = f" after update {update:,} of {settings.updates:,}, as every seed has reached {goal}"
-    return f"done{why}; judge {what} with: {_command('evaluate', f'policy={policy}', *code)}"
+    return f"done{why}; evaluate {what} with: {_command('evaluate', f'policy={policy}', *code)}"
 
 
 def _command(*arguments: str) -> str:

@@ -66,4 +66,4 @@ def test_a_run_that_was_stopped_goes_on_by_the_command_as_printed(
     words = [*KINDS["a space"], "budget=64", "run.stop_after=2", f"run.dir={tmp_path / 'a run'}"]
     assert train.main(words) == 0
     assert train.main(_pasted(capsys.readouterr().out, "train")) == 0
-    assert "done; judge the policy with:" in capsys.readouterr().out
+    assert "done; evaluate the policy with:" in capsys.readouterr().out

@@ -123,7 +123,9 @@ def test_such_a_run_that_is_resumed_says_so_and_stays_as_it_is(
     more = "for more, give a larger one, or run.stop_at=null"
     assert f"nothing left to train: {reached}; {more}" in said
     updates = 15_625 if words else UPDATES
-    assert f"done after update {end} of {updates:,}, as {reached}; judge each of 2 policies" in said
+    assert (
+        f"done after update {end} of {updates:,}, as {reached}; evaluate each of 2 policies" in said
+    )
     assert _contents(stopped) == before
 
 

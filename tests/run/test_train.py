@@ -212,7 +212,7 @@ def test_a_run_that_is_done_says_so_and_stays_as_it_is(
     assert train.main([f"resume={copied}"]) == 0
     said = capsys.readouterr().out
     assert "nothing left to train: the budget is spent; for more, give a larger budget\n" in said
-    assert "done; judge the policy with:" in said
+    assert "done; evaluate the policy with:" in said
     assert _contents(copied) == before
 
 
