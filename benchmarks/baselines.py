@@ -73,7 +73,12 @@ def meta(learners: int, activation: str) -> dict[str, Any]:
             "max_wheel_speed": epuck.MAX_WHEEL_SPEED,
         },
         "sensors": {"preset": "ideal", "response": "ideal", "range": epuck.SENSOR_RANGE},
-        "task": {"control_step": 0.032, "target_radius": 0.05, "arrival": "latch"},
+        "task": {
+            "control_step": 0.032,
+            "target_radius": 0.05,
+            "arrival": "latch",
+            "observations": [],  # so that `compare` takes it beside a trained policy
+        },
         "realism": {"name": "ideal", "infrared": "ideal"},
         "stages": [{"name": "mine", "robots": 2, "side": 1.0}],
         "extensions": {},
