@@ -214,7 +214,7 @@ def flat_gradient(
     actor, surrogate = run("actor", surrogate_loss)
     critic, error = run("critic", _half_square)
     count = error.pop("valid")
-    weight = count * share  # weight in the mean of a term that all samples share
+    weight = count * share  # weight of a term that is equal for all samples
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}
