@@ -150,7 +150,7 @@ _MISSING = object()
 
 
 def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-    """Refuses contents that do not make a policy.
+    """Refuses contents that are not a valid policy.
 
     Args:
       arrays: All arrays of a file except `meta` and `digest`.

@@ -23,7 +23,8 @@ from swarmjax.reproduce.criteria import Criterion, about, crowded, earlier, high
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, PAIR, TUNED, Reproduction
 
-# Share of targets reached that counts as the desired behaviour; also promotes from a stage.
+# Share of targets reached that counts as the desired behaviour, and that promotes to the next
+# stage.
 GENERATED = 0.8
 FAILED = 0.5  # a swarm fails if it reaches a smaller share of its targets
 HELD = {True: "holds", False: "contradicted", None: "open"}
@@ -151,8 +152,8 @@ def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
       axis: unit in which places are counted.
 
     Returns:
-      For each reading: the goal, what is counted, and a function that finds an arm's places by
-      seed.
+      For each reading: the goal, what is counted, and a function that finds where each seed of an
+      arm reaches the goal.
     """
     which = "all episodes" if stage is None else f"episodes on {stage}"
     counted = f"{which}, {measures.UNITS[axis]}"

@@ -14,7 +14,7 @@ from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 # (None if undecided), and the numbers as text.
 type Criterion = Callable[..., tuple[bool | None, str]]
 
-ABOUT = 0.5  # we read "approximately a number" as: at most this share of the number away from it
+ABOUT = 0.5  # we read "approximately X" as X plus or minus this share of X
 # A difference is found with a probability of 0.8 if it is (1.96 + 0.84) standard errors from 0. The
 # 95 % interval is 2 * 1.96 standard errors wide.
 _POWER = (1.96 + 0.84) / (2 * 1.96)

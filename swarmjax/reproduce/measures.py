@@ -172,8 +172,8 @@ def judged(
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     """Counts how many more steps with something in range the last robot had than the first robot.
 
-    First and last are meant by arrival. The first robot finds no other robot at the targets. The
-    last robot finds all the others that have arrived.
+    First and last refer to the order of arrival. The first robot finds no other robot at the
+    targets. The last robot finds all the others that have arrived.
 
     Args:
       data: the reproduction's data.
