@@ -26,7 +26,7 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
 
     Args:
       stage: plain data of the stage that becomes the last one.
-      axes: values of each axis, from easy to hard, without the stage's own value.
+      axes: values of each axis, from easy to hard; they exclude the stage's own value.
 
     Returns:
       Plain data of the stages; the last one is `stage`.

@@ -34,7 +34,7 @@ from swarmjax.task import extended
 # Share of the arenas on earlier stages with `mixed`, and on learned stages with `frontier`. This
 # project chose the value.
 _EARLIER = 0.2
-_UNKNOWN_LEARNABILITY = 0.25  # largest p (1 - p), so that unknown stages are tried
+_UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)

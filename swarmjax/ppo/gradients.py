@@ -212,13 +212,14 @@ def take(
 
     Args:
       learning: The optimiser, and how the samples are spread over devices.
-      progress: Parameters and the optimiser's state before.
+      progress: Parameters and the optimiser's state before the step.
       found: The gradient, and the metrics of its loss.
       any_valid: [], whether any sample that the gradient includes is valid.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics of the loss plus `grad_norm`,
-      `taken_steps` and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
+      Parameters and the optimiser's state after the step, and the metrics of the loss plus
+      `grad_norm`, `taken_steps` and `skipped_steps`. In a skipped step all metrics but
+      `skipped_steps` are zero.
     """
     params, optimizer_state = progress
     # One sum of all values: on several devices, each sum takes tens of microseconds at any size.

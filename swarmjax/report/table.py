@@ -218,7 +218,7 @@ def text(lines: Sequence[TableLine]) -> str:
             written.append("  ".join(map(str.ljust, parts, widths)).rstrip())
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
-        f"Success: {measures} on the last stage, over its newest episodes begun together; mean "
-        f"over seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
+        f"Success: {measures} on the last stage, over its newest episodes that began together. "
+        f"Mean over seeds, with its 95 % bootstrap interval for {LEAST_DRAWN} seeds or more."
     )
     return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])

@@ -149,7 +149,7 @@ def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
 
     Args:
       stage: uses only the episodes of this stage; None for all.
-      axis: unit in which places are counted.
+      axis: whether to count training in episodes or in arena control steps.
 
     Returns:
       For each reading: the goal, what is counted, and a function that finds where each seed of an
@@ -170,7 +170,8 @@ def _steady(stage: str | None, axis: Axis) -> list[Source]:
 def _rewarded() -> list[Source]:
     """Lists the ways to find where the reward on the last stage nears its best value.
 
-    There are two, for the reward of robot 1 and for the mean reward, in each unit of the place.
+    There are four: by the reward of robot 1 or by the mean reward, counted in episodes or in arena
+    control steps.
     """
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
     return [

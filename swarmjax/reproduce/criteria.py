@@ -37,7 +37,7 @@ def within(
 
 
 def about(number: float) -> Criterion:
-    """Makes the criterion that a place is approximately this number."""
+    """Makes the criterion that values, such as episode numbers, are approximately this number."""
     return partial(within, low=(1 - ABOUT) * number, high=(1 + ABOUT) * number, unit=PLACE)
 
 
@@ -65,7 +65,7 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the first arm reaches a goal earlier, where inf means never.
+    """Tests whether the first arm reaches a goal earlier; inf stands for never.
 
     The test estimates the probability that a seed of the first arm is earlier than a seed of the
     second arm. The claim holds if the interval of this probability lies above 0.5. It is

@@ -78,7 +78,7 @@ def _lock(run: Path, held: contextlib.ExitStack) -> None:
     file = held.enter_context((run / LOCK).open("a+"))
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not os.fstat(file.fileno()).st_nlink:  # removed by its holder between open and lock
+        if not os.fstat(file.fileno()).st_nlink:  # its holder removed it before we locked it
             raise BlockingIOError
     except BlockingIOError:
         file.seek(0)

@@ -71,7 +71,7 @@ class LivePage:
         try:
             self.history = rows.read(self.run)
             self.figures, self.trouble = figures.png_files(self.history), ""
-        except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
+        except (ConfigError, OSError) as error:  # for example, somebody removed the run
             self.trouble = str(error)
         now = time.monotonic()
         self._drawn, self._rests_until = written, now + (now - began) * (1.0 - SHARE) / SHARE
