@@ -79,9 +79,8 @@ class Counts(NamedTuple):
     def deciding(self, what: str, budget: int) -> float:
         """Returns how many episodes would show whether the budget holds at least one success.
 
-        This takes the counted chance as the true one. After that many episodes, the interval of the
-        chance excludes one success per budget. The interval is exact if no success was counted,
-        else normal.
+        This takes the counted chance as the true one. Its interval then excludes one success per
+        budget. The interval is exact if no success was counted, else normal.
         """
         chance, one = self.share(what).estimate, self.steps / (budget * self.episodes)
         if not chance:

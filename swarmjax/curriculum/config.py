@@ -23,8 +23,7 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 class CurriculumConfig(Section):
     """Settings: which arenas train on which stage, when that changes, and what a promotion changes.
 
-    Some options have an effect only in some modes. The description of such an option ends with
-    these modes, in brackets.
+    Some options have an effect only in some modes. Their descriptions name these modes in brackets.
     """
 
     mode: str = setting(

@@ -22,8 +22,8 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 class AlgoConfig(Section):
     """Settings of PPO. Names in quotes are those in Table 1 of the paper (docs/paper.md).
 
-    Some options have an effect only with one choice of another key. The description of such an
-    option ends with this key and choice, in brackets.
+    Some options have an effect only with one choice of another key. Their descriptions name this
+    key and choice in brackets.
     """
 
     name: Literal["ppo", "paper"] = setting(

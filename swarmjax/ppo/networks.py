@@ -34,8 +34,8 @@ _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 # critic's errors (docs/results.md, "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
-# Least standard deviation to divide an observation by. A number that has hardly varied yet is thus
-# magnified by at most 1 / MIN_STD.
+# Least standard deviation to divide an observation by. It magnifies a number that has hardly varied
+# by at most 1 / MIN_STD.
 MIN_STD = 1e-3
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
 # continuous-action detail 7: bound of normalised observations.

@@ -330,7 +330,7 @@ def _gather(samples: Batch, rows: jax.Array, config: AlgoConfig) -> Batch:
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
-    """Deals this device's G groups out to minibatches, [M, G / M], within each random stream."""
+    """Distributes the device's G groups over minibatches, [M, G / M], within each random stream."""
     streams = shards.local_streams
     size = groups // streams
 

@@ -173,7 +173,7 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     """Counts how many more steps with something in range the last robot had than the first robot.
 
     First and last refer to the order of arrival. The first robot finds no other robot at the
-    targets. The last robot finds all the others that have arrived.
+    targets, and the last robot finds all others that arrived.
 
     Args:
       data: the reproduction's data.

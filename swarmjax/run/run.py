@@ -91,8 +91,8 @@ class Run:
           display: shows the run; None: nothing is shown.
           loggers: receive the rows, beside the loggers that the config names.
           on_update: called with a copy of each row; it returns True to stop the run.
-          keep_traces: whether to keep traced programs for later runs. Set it only in a new process,
-            which runs the code that is in the files: their digest is the key.
+          keep_traces: whether to keep traced programs for later runs. Only for a new process: its
+            code is that of the files, and their digest is the key.
         """
         self.settings = settings
         self._stop = stop or Stop()
@@ -261,10 +261,7 @@ class Run:
             raise outputs.unwritable("run.dir", self.path, error) from None
 
     def _train_chunks(self) -> None:
-        """Trains until the run has ended, `run.stop_after` is reached or a stop is requested.
-
-        A thread writes the checkpoints while training continues.
-        """
+        """Trains until the run has ended, `run.stop_after` is reached or a stop is requested."""
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (

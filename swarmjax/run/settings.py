@@ -49,8 +49,7 @@ class TrainConfig(ProgramConfig):
     """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
-    # Keys that a recipe may set: they say what is trained. The other keys (code, folders, loggers,
-    # the run to start from) are left to whoever starts the run.
+    # Keys that a recipe may set: they say what is trained. Whoever starts the run sets all others.
     shared: ClassVar[tuple[str, ...]] = (
         *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
         *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),

@@ -20,7 +20,7 @@ OTHERS_PER_ROBOT = 3
 # size at once.
 ROWS_PER_ROBOT = 6
 _STARTING = threading.Lock()  # `train` starts Warp in a thread; two starts would create Warp twice
-FEW_ARENAS = 64  # in so few arenas, every pair of geoms gets memory: all arenas may be crowded
+FEW_ARENAS = 64  # in so few arenas, every pair of geoms gets memory
 
 # Model and data of MJX (in either implementation), or of a faster engine that uses the same field
 # names.

@@ -145,7 +145,7 @@ def layouts(params: Params) -> dict[str, KernelLayout]:
 def shuffle(
     keys: jax.Array, samples: int, valid: jax.Array, minibatches: int, launch: Launch
 ) -> Tiles:
-    """Deals the tiles that hold valid samples out to minibatches, as evenly as possible.
+    """Distributes the tiles that hold valid samples over minibatches, as evenly as possible.
 
     If there are fewer such tiles than minibatches, some minibatches get none.
 

@@ -88,9 +88,9 @@ def arrange(samples: Batch, steps: int) -> Batch:
 def deal(
     key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE
 ) -> tuple[jax.Array, jax.Array]:
-    """Deals the sequences with a valid sample out to minibatches at random.
+    """Distributes the sequences with a valid sample over minibatches at random.
 
-    Each stream of random numbers deals its own sequences out, as evenly as possible, so that a
+    The sequences of each stream of random numbers are distributed as evenly as possible, so that a
     minibatch holds the same sequences on any number of devices. If a stream has fewer sequences
     than there are minibatches, the last minibatches get no sequence of this stream.
 
