@@ -55,7 +55,7 @@ def _one_error[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return function(*args, **kwargs)
-        except OSError:  # perhaps from a function that the caller has given
+        except OSError:  # may come from a function of the caller
             raise
         except Exception as error:
             found = command.explain(error, (CheckpointError, TrainingError))
@@ -243,7 +243,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Returns settings as command-line words. Returns stages apart if no word can name them."""
+    """Returns settings as command-line words, and separately the stages that no word can name."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))

@@ -66,7 +66,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """Input of the policy, [A, R, O]. If an arena's episode has ended, the next one's input."""
+        """Input of the policy, [A, R, O]. After an episode's end, the next one's first."""
         return self.arenas.observation
 
     @property

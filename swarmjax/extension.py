@@ -40,7 +40,7 @@ TAKEN = {
     "goal": ("navigate", "lifelong", "gather", "cover"),
 }
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
-_LARGEST = 3.4e38  # as in `config.section`: float32 holds nothing beyond
+_LARGEST = 3.4e38  # as in `config.section`: float32 holds no larger number
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, type(None))
 
 

@@ -1,4 +1,4 @@
-"""Shows that long work goes on: a line now and then, also where the output is no terminal."""
+"""Prints a line now and then while long work goes on, also where the output is no terminal."""
 
 import contextlib
 import os
@@ -11,10 +11,10 @@ from typing import Any
 
 from swarmjax import words
 
-EVERY_S = 10.0  # time between two lines
+EVERY_S = 10.0  # time between two lines, s
 
 # Filters XLA's advice to file a bug about a program that compiles for two minutes. The advice is an
-# error of XLA's log, and no setting of XLA hides it without all other errors.
+# error of XLA's log, and no setting of XLA hides it without hiding all other errors.
 _ADVICE = r"slow_operation_alarm\.cc|^\*{32}$|^\[Compiling module |^Very slow compile\?|^The opera"
 _FILTER = f"""import re, sys
 for line in sys.stdin.buffer:
@@ -23,7 +23,7 @@ for line in sys.stdin.buffer:
 
 @contextlib.contextmanager
 def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> Iterator[None]:
-    """Says a text and for how long the block has run, every `EVERY_S`, and hides XLA's advice.
+    """Says every `EVERY_S` s a text and how long the block has run, and hides XLA's advice.
 
     Another process filters standard error, so that the last words of a process that crashes are
     printed too. It has a session of its own, so that Ctrl-C does not end it.
@@ -52,7 +52,7 @@ def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> 
 
 @contextlib.contextmanager
 def progress(command: str) -> Iterator[Any]:
-    """Shows on standard error how far a command is: a bar on a terminal, elsewhere lines.
+    """Shows a command's progress on standard error: a bar on a terminal, elsewhere lines.
 
     Args:
       command: name of the command.
@@ -60,7 +60,7 @@ def progress(command: str) -> Iterator[Any]:
     Yields:
       Rich's progress, to which tasks are added.
     """
-    from rich.console import Console  # a run, which shows no bar, does not wait for it
+    from rich.console import Console  # slow, and not needed for a run
     from rich.progress import Progress
 
     console = Console(stderr=True)

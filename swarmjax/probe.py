@@ -73,14 +73,14 @@ class Counts(NamedTuple):
         return interval(self.episodes * getattr(self, what) / of, self.episodes)
 
     def expected(self, what: str, budget: int) -> Interval[float]:
-        """Returns how many of the episodes in a budget of control steps are such by chance."""
+        """Returns how many successes of the kind `what` to expect in a budget of control steps."""
         return Interval(*(p * budget * self.episodes / self.steps for p in self.share(what)))
 
     def deciding(self, what: str, budget: int) -> float:
-        """Returns how many episodes would show whether the budget has at least one such episode.
+        """Returns how many episodes would show whether the budget holds at least one success.
 
-        It takes the chance that was counted as the true one. Its interval excludes one episode in
-        the budget by then: an exact interval if there was none, else a normal one.
+        This takes the counted chance as the true one. Its interval then excludes one success per
+        budget. The interval is exact if no success was counted, else normal.
         """
         chance, one = self.share(what).estimate, self.steps / (budget * self.episodes)
         if not chance:
@@ -88,10 +88,11 @@ class Counts(NamedTuple):
         return _DEVIATIONS**2 * chance / (chance - one) ** 2 if chance != one else math.inf
 
     def product(self, budget: int) -> float:
-        """Returns the most episodes in a budget to expect with all robots at their targets at once.
+        """Returns at most how many episodes to expect with all robots at their targets at once.
 
-        All of them are visitors then, so the chance is at most that of one visitor to the power of
-        the number of robots, if each robot comes to its target independently of the others.
+        In such an episode, every robot is a visitor. So the chance is at most that of one visitor
+        to the power of the number of robots, if each robot comes to its target independently of the
+        others.
         """
         chance = self.share("visitors").high ** (self.robots / self.episodes)
         return chance * budget * self.episodes / self.steps
@@ -101,7 +102,7 @@ def interval(successes: float, trials: int) -> Interval[float]:
     """Computes a chance with its exact interval (Clopper & Pearson 1934).
 
     Args:
-      successes: number of successes. A sum of shares between 0 and 1 is taken too. Its interval is
+      successes: number of successes. It may be a sum of shares between 0 and 1, whose interval is
         too wide rather than too narrow, since shares vary less than successes of the same mean.
       trials: number of trials.
     """
@@ -199,7 +200,7 @@ def count(ended: Ended) -> Counts:
 
 
 def paid(task: TaskConfig) -> str:
-    """Returns the episodes in which a reward for arriving is paid: with `any` visitor, or `all`."""
+    """Returns which episodes pay a reward for arriving: those with `any` visitor, or with `all`."""
     in_time = task.reward.step_penalty != 0  # paid for each step, also with `hold`
     together = task.arrival == "hold" or task.goal == "gather"
     return "all" if together and not in_time else "any"
@@ -261,7 +262,7 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
     enough = _number(last.deciding(signal, settings.budget))
     return (
         f"{says} {low} to {high} such episodes in the budget, which leaves {name} alone undecided: "
-        f"about {enough} episodes would decide (episodes), or {use}"
+        f"give about {enough} episodes to decide, or {use}"
     )
 
 

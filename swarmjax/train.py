@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
         from swarmjax.run.load_settings import load_run
 
         settings = load_run(arguments)
-        if not settings.run.distributed:  # else the processes must first find each other
+        if not settings.run.distributed:  # distributed processes must first find each other
             threading.Thread(target=_open_device, args=(settings.sim.impl,)).start()
         from swarmjax.run.display import Display
         from swarmjax.run.run import Run

@@ -183,7 +183,7 @@ def _counts(**given: int) -> Counts:
          "budget (560 to 970): training on s6 alone can begin."),
         (["task.reward.progress=0"], {},
          "Nothing is paid until a robot arrives. Chance gives 0 to 55 such episodes in the budget, "
-         "which leaves s6 alone undecided: about 28,000 episodes would decide (episodes), or use a "
+         "which leaves s6 alone undecided: give about 28,000 episodes to decide, or use a "
          "curriculum (docs/curriculum.md)."),
         (["task.reward.progress=0", "budget=1e4"], {},
          "Nothing is paid until a robot arrives. Chance gives fewer than 0.18 such episodes in the "

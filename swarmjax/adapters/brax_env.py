@@ -105,7 +105,7 @@ class SwarmBraxEnv(_base.Env):
 
 
 def mended_jax() -> AbstractContextManager:
-    """Gives JAX back `device_put_replicated` in a `with` block.
+    """Restores the function `jax.device_put_replicated` in a `with` block.
 
     Brax 0.14.2 calls this function, but JAX 0.10 has removed it. The function put one copy of an
     array on each device, stacked along a new axis.

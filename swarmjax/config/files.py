@@ -20,7 +20,7 @@ _MOST_KEY = 200  # letters of a key on the command line
 
 # For these groups, the message about an unknown choice says that the path of a file is allowed too.
 _OWN_FILES = ("stage", "robot", "realism", "recipes")
-# The files of this group may set keys of every section, as `algo=paper` does, not only its own.
+# Files of this group may set keys of any section, not only of their own; `algo=paper` does.
 _WHOLE = "algo"
 
 # A function that takes the composed data and the choice of each group, and returns the keys and

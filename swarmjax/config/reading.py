@@ -199,7 +199,7 @@ def _measure(events: Iterable[Any], where: str) -> None:
         if getattr(event, "tag", None) is not None:
             raise ConfigError(f"{where}remove the YAML tag {show(event.tag)}.")
         if isinstance(event, yaml.AliasEvent):  # a few lines of aliases may stand for billions
-            raise ConfigError(f"{where}replace the YAML alias *{event.anchor} by its value.")
+            raise ConfigError(f"{where}replace the YAML alias *{event.anchor} with its value.")
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         count += isinstance(event, yaml.CollectionStartEvent | yaml.ScalarEvent)

@@ -19,8 +19,8 @@ from swarmjax.config import reading, values
 from swarmjax.config.values import ConfigError, check_text, show
 
 MAX_COUNT = 2**31 - 1  # counts and seeds are int32 on the device
-# Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number by 0
-# if the number is nearer to 0 than `_SMALLEST`.
+# Other numbers are float32, which holds nothing beyond `_LARGEST`. A device replaces a number with
+# 0 if the number is nearer to 0 than `_SMALLEST`.
 _LARGEST, _SMALLEST = 3.4e38, 1.2e-38
 
 
@@ -68,7 +68,7 @@ class Bounds:
         return ", ".join(given) or "any finite number"
 
 
-def about(  # most calls give two or three
+def about(  # most calls give two or three arguments
     meaning: str,
     low: float = -math.inf,
     high: float = math.inf,
@@ -131,7 +131,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
     Args:
       section: the settings.
       options: for each option, the key that decides whether it is read, and the values of that key
-        with which it is. With other values, the option must have its default.
+        with which it is read. With other values, the option must have its default.
 
     Raises:
       ConfigError: an option has another value than its default, and is not read.
@@ -148,7 +148,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
 
 
 class ByName(dict[str, Any]):
-    """A mapping to values from names that no section defines.
+    """A mapping from names, which no section defines, to values.
 
     It is never changed, so that settings are hashable.
     """
@@ -253,7 +253,7 @@ def convert(hint: object, value: object, key: str) -> object:
 
 
 def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
-    """Converts a list of values of one type. One of several sections is called by its own name."""
+    """Converts a list of values of one type. Errors in one of several sections give its name."""
     if not isinstance(value, list | tuple):
         raise ConfigError(f"{key} is {show(value)}: give {values.describe(hint)}.")
     inner = typing.get_args(hint)[0]

@@ -35,7 +35,7 @@ class ConfigError(ValueError):
 
 
 def options(hint: object) -> tuple[Any, ...]:
-    """Returns the members of a union type, or any other type as the only member."""
+    """Returns the members of a union type; for any other type, the type as the only member."""
     is_union = typing.get_origin(hint) in (types.UnionType, typing.Union)
     return typing.get_args(hint) if is_union else (hint,)
 

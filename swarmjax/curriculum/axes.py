@@ -1,8 +1,8 @@
-"""Curricula along axes: a stage, and easier values of its numbers, become a grid of stages.
+"""Curricula along axes: make a grid of stages from one stage and easier values of its numbers.
 
 With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
-an axis is the stage's own, so the last stage is the stage itself. From one
-stage to the next, the last axis changes fastest.
+an axis is the stage's own, so the last stage of the grid is the given stage. From one stage to the
+next, the last axis changes fastest.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from swarmjax.task.layouts.site import NUMBERS
 from swarmjax.task.stage_files import complete
 
 AXES = ("robots", "side", "distance", "obstacles", "obstacle_size", "breadth", "cells", *NUMBERS)
-MOST_STAGES = 64  # of a grid; each stage has a record and a column in the log
+MOST_STAGES = 64  # most stages of a grid; each has a record and a column in the log
 
 
 def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -26,7 +26,7 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
 
     Args:
       stage: plain data of the stage that becomes the last one.
-      axes: values of each axis, from easy to hard, without the stage's own value.
+      axes: values of each axis, from easy to hard; they exclude the stage's own value.
 
     Returns:
       Plain data of the stages; the last one is `stage`.

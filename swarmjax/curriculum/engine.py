@@ -360,7 +360,7 @@ def _add(tally: CohortTally, ended: Ended, cohort: Array, shards: Shards) -> Coh
 
 
 def _record(record: Record, tally: CohortTally, judged: Array, success: Success) -> Record:
-    """Records a cohort whose episodes have all ended, for the stages [S] on which it had any."""
+    """Records a cohort whose episodes have all ended, for the stages [S] where it had any."""
     robots, episodes = jnp.maximum(tally.targets, 1), jnp.maximum(tally.episodes, 1)
     newest = Record(
         episodes=tally.episodes,

@@ -34,7 +34,7 @@ from swarmjax.task import extended
 # Share of the arenas on earlier stages with `mixed`, and on learned stages with `frontier`. This
 # project chose the value.
 _EARLIER = 0.2
-_UNKNOWN_LEARNABILITY = 0.25  # largest p (1 - p), so that unknown stages are tried
+_UNKNOWN_LEARNABILITY = 0.25  # largest value of p (1 - p), so that unknown stages are tried
 # The golden ratio in steps of 2**-32: no other number has multiples that fill the circle more
 # evenly (Knuth, The Art of Computer Programming 3, section 6.4, multiplicative hashing, theorem S).
 _GOLDEN = np.uint32(2654435769)
@@ -199,7 +199,7 @@ def adaptive(
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
     if options.shares == "robots":
-        # Shares of arenas with which each stage's share of the robots is its weight.
+        # Choose shares of arenas so that each stage's share of the robots equals its weight.
         arenas = weights / jnp.asarray(schedule.stages.robots).astype(jnp.float32)
         weights = arenas / jnp.sum(arenas)
     judged = verdict.over & jnp.any(verdict.judged)
@@ -220,10 +220,10 @@ def frontier(
     """Trains the open stages that are not learned, and keeps some arenas on learned stages.
 
     A stage is learned while its running success is at least its `threshold`. It is open while all
-    stages one step easier are learned. So success widens the frontier, failure narrows it, and no
-    budget moves it. The last stage stays in training once it is open. Widening each axis by its own
-    success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube with a
-    Robot Hand", arXiv:1910.07113, section 5).
+    stages one step easier are learned. So success widens the frontier, failure narrows it, and the
+    budget does not move it. The last stage stays in training once it is open. Widening each axis by
+    its own success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's
+    Cube with a Robot Hand", arXiv:1910.07113, section 5).
 
     Args:
       state: as in `promoting`.

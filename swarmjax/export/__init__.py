@@ -1,4 +1,4 @@
-"""Exports policies in other forms: NumPy, ONNX, C99 and a Webots controller.
+"""Exports policies in several formats: NumPy, ONNX, C99 and a Webots controller.
 
 This package imports `policy_file`, the sensor responses of `sim`, and `run`, which reads a run's
 checkpoint. Read `__main__.main` first.

@@ -92,7 +92,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
 
 
 def _default(settings: ExportConfig) -> str:
-    """Returns the default name of the export. With `step`, it is not that of the final policy."""
+    """Returns the export's default name. With `step`, it differs from the final policy's name."""
     name = Path(_NAMES[settings.format])
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")
@@ -100,16 +100,16 @@ def _default(settings: ExportConfig) -> str:
 
 
 def convert(settings: ExportConfig, source: Path, out: Path) -> None:
-    """Writes a policy file in another form.
+    """Writes a policy file in another format.
 
     Args:
-      settings: the export's settings, which give the form.
+      settings: the export's settings, which give the format.
       source: the policy file.
       out: the file or folder to write.
 
     Raises:
       PolicyError: if the policy file is unsound.
-      ConfigError: if the policy does not fit the form, or `out` cannot be written.
+      ConfigError: if the format cannot hold the policy, or `out` cannot be written.
     """
     meta, content = policy_file.read_meta(source), source.read_bytes()
     if settings.format == "npz":
@@ -130,7 +130,7 @@ def convert(settings: ExportConfig, source: Path, out: Path) -> None:
 
 
 def _check_form(meta: Mapping[str, Any], form: str) -> None:
-    """Checks that a form can hold a policy, and that its controller can measure all inputs."""
+    """Checks that a format can hold a policy, and that Webots can measure the policy's inputs."""
     if "network" in meta:
         raise PolicyError(
             f"format is {form}, but only npz can hold the policy's network "

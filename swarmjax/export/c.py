@@ -33,7 +33,7 @@ def render(trained: Policy) -> dict[str, bytes]:
     """
     templates = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).resolve().parent / "templates" / "c"),
-        autoescape=False,  # the files are no HTML, and a policy's names have plain letters only
+        autoescape=False,  # not HTML; a policy's names have only plain letters
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -9,7 +9,7 @@ from swarmjax.config.section import MAX_COUNT
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """Settings: which policy to export, in which form, and where to."""
+    """Settings: which policy to export, in which format, and where to."""
 
     command: ClassVar[str] = "export"
 

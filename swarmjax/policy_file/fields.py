@@ -59,7 +59,7 @@ def _whole(least: int, most: int | None = None) -> _Rule:
 
 
 def _words(kind: str, form: re.Pattern[str]) -> _Rule:
-    """Makes the rule for a list of words that are safe in a comment of any language."""
+    """Makes the rule for a list of words that cannot open or close a comment in source code."""
     return _Rule(
         f"a list of {kind} in plain letters",
         lambda value: _are(value, lambda word: _is_word(word, form)),
@@ -150,7 +150,7 @@ _MISSING = object()
 
 
 def check(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-    """Refuses contents that do not make a policy.
+    """Refuses contents that are not a valid policy.
 
     Args:
       arrays: All arrays of a file except `meta` and `digest`.

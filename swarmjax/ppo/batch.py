@@ -26,8 +26,8 @@ class Trajectory(NamedTuple):
       value: the critic's value of the observation.
       next_value: value of the observation after the step, before any reset.
       reward: reward for the step.
-      terminated: whether nothing more can be earned after the step.
-      truncated: whether the time ran out with the step.
+      terminated: whether no reward can follow the step.
+      truncated: whether the step reached the episode's time limit.
       valid: whether to learn from the transition.
       state: [.., P], what the critic sees in addition to the observation; () if nothing.
     """
@@ -63,7 +63,7 @@ class Batch:
         group, or () without memory. With memory, the N samples of a group are ordered by step,
         [T S].
       begins: [G, N], whether an episode begins with the step; None without memory.
-      state: [G, N, P], numbers of order 1 that the critic sees in addition; () if there are none.
+      state: [G, N, P], numbers of order 1 that the critic sees beside the observation; () if none.
     """
 
     observation: jax.Array
@@ -156,7 +156,7 @@ def generalized_advantages(
       values: [T, ...], value of the observation before step t.
       next_values: [T, ...], value of the observation after step t, before any reset; ignored
         where `terminated`.
-      terminated: [T, ...], bool: the task ended here and nothing more can be earned.
+      terminated: [T, ...], bool: the task ended here and no reward can follow.
       truncated: [T, ...], bool: the episode was cut here and would have gone on.
       discount: Per step, 0..1.
       gae_lambda: 0 (one-step temporal difference) .. 1 (Monte Carlo).
@@ -173,7 +173,7 @@ def generalized_advantages(
 
 
 def sum_back(terms: jax.Array, ends: jax.Array, factor: float) -> jax.Array:
-    """Sums discounted terms from each step to the next end, or to the end of the rollout.
+    """Sums discounted terms from each step to the next step in `ends`, or to the rollout's end.
 
     Args:
       terms: [T, ...], term of step t.

@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
 from swarmjax.extension import Network
 
-# Options that are read only with some choices of another key: by option, that key and the choices.
+# Options that have an effect only with some choices of another key. Values: that key, its choices.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     "gae_lambda": ("advantage", ("gae",)),
     "memory_size": ("memory", ("gru",)),
@@ -20,10 +20,10 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class AlgoConfig(Section):
-    """Settings of PPO; names in quotes are those in Table 1 of the paper.
+    """Settings of PPO. Names in quotes are those in Table 1 of the paper (docs/paper.md).
 
-    Some options are read only with one choice of another key. Their texts end with this key and
-    choice, in brackets.
+    Some options have an effect only with one choice of another key. Their descriptions name this
+    key and choice in brackets.
     """
 
     name: Literal["ppo", "paper"] = setting(

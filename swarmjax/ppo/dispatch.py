@@ -14,8 +14,7 @@ from swarmjax.ppo.networks import Networks, Sizes
 
 # XLA runs Triton's kernels on NVIDIA GPUs of this compute capability or later (8 is Ampere).
 _LEAST_GENERATION = 8
-# JAX's names for matrix products without tensor cores
-# (`jax.default_matmul_precision`).
+# Values of `jax.default_matmul_precision` with which matrix products avoid tensor cores.
 _FULL = ("highest", "float32", "F32_F32_F32")
 
 # autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block.
@@ -35,13 +34,13 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
     Args:
       config: Settings of the learner.
       networks: Actor and critic.
-      sizes: Sizes of what the networks see and do.
+      sizes: Sizes of observations, actions and states.
 
     Returns:
       The backend.
     """
     auto = config.update_backend == "auto"
-    if config.memory != "none":  # other faster ways ignore the order of samples
+    if config.memory != "none":  # the other faster ways ignore the order of steps
         return "sequences" if auto else "autodiff"
     if auto and _fuses(config, networks, sizes):
         return "fused"
@@ -50,7 +49,7 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
 
 
 def memory_kernels(config: AlgoConfig) -> Any:
-    """Chooses the kernels that compute a memory.
+    """Chooses the GPU kernels that compute a policy's memory.
 
     Args:
       config: Settings of the learner.
@@ -73,7 +72,7 @@ def find(backend: Backend) -> Learn:
 
 
 def _fuses(config: AlgoConfig, networks: Networks, sizes: Sizes) -> bool:
-    """Tells whether kernels may compute the update."""
+    """Tells whether the kernels of `fused.py` can compute the update."""
     plain = config.critic == "observation" and networks.actor.torso is None
     if not plain or not _runs_kernels():
         return False

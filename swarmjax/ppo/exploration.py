@@ -1,4 +1,4 @@
-"""The schedule of exploration: the deviation of the action falls in steps, as in PPO-PyTorch."""
+"""The exploration schedule: the action's standard deviation falls in steps, as in PPO-PyTorch."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from swarmjax.ppo.config import AlgoConfig
 
 
 def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
-    """Lists the deviations of the schedule, from `initial_std` to the last deviation.
+    """Lists the standard deviations of the schedule, from `initial_std` to the last one.
 
     Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
     is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
@@ -22,7 +22,7 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
     stds = [config.initial_std]
     while stds[-1] > config.std_floor:
         lower = round(stds[-1] - config.std_decrement, 4)
-        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
+        # Rounding can undo a small decrement: PPO-PyTorch's deviation would then never fall.
         if lower == stds[-1]:
             break
         stds.append(max(lower, config.std_floor))

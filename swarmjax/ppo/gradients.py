@@ -30,7 +30,7 @@ GUESS_COST = 0.02
 
 
 class Learning(NamedTuple):
-    """Code that all ways of computing an update share.
+    """What every way of computing an update needs.
 
     Attributes:
       config: settings of PPO.
@@ -68,8 +68,8 @@ def ppo_loss(
 
     The bound term is the squared distance of the mean action from -1..1, summed over the action.
     This term follows `bounds_loss` of rl_games, where the range ends at 1.1. If the mean lies
-    several deviations beyond the range, all sampled actions have the same effect, and the policy
-    learns nothing from them.
+    several standard deviations beyond the range, all sampled actions have the same effect, and the
+    policy learns nothing from them.
 
     The guess term is the squared error of the actor's guess of the state, summed over its numbers.
 
@@ -212,13 +212,14 @@ def take(
 
     Args:
       learning: The optimiser, and how the samples are spread over devices.
-      progress: Parameters and the optimiser's state before.
+      progress: Parameters and the optimiser's state before the step.
       found: The gradient, and the metrics of its loss.
       any_valid: [], whether any sample that the gradient includes is valid.
 
     Returns:
-      Parameters and the optimiser's state after, and the metrics of the loss plus `grad_norm`,
-      `taken_steps` and `skipped_steps`. In a skipped step all metrics but `skipped_steps` are zero.
+      Parameters and the optimiser's state after the step, and the metrics of the loss plus
+      `grad_norm`, `taken_steps` and `skipped_steps`. In a skipped step all metrics but
+      `skipped_steps` are zero.
     """
     params, optimizer_state = progress
     # One sum of all values: on several devices, each sum takes tens of microseconds at any size.
@@ -252,9 +253,9 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
       but some were skipped, the means are -inf. If no step was taken or skipped, they are 0.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
-    # Exactly 1 if all steps of the update were taken.
+    # This is exactly 1 if all steps of the update were taken.
     share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
-    # Lost means are -inf and not NaN, because JAX_DEBUG_NANS would stop at a NaN.
+    # A mean over no steps is -inf and not NaN, because JAX_DEBUG_NANS would stop at a NaN.
     lost = (taken == 0) & (skipped > 0)
     means = {n: jnp.where(lost, -jnp.inf, jnp.mean(x) * share) for n, x in metrics.items()}
     del means["taken_steps"]

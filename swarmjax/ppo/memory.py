@@ -104,7 +104,7 @@ class Gru(nn.Module):
 def uniform(
     key: jax.Array, shape: tuple[int, ...], dtype: Any = jnp.float32, *, bound: float
 ) -> jax.Array:
-    """Draws numbers within +-`bound`, with the signature of Flax's initialisers."""
+    """Samples numbers within +-`bound`, with the signature of Flax's initialisers."""
     return jax.random.uniform(key, shape, dtype, -bound, bound)
 
 

@@ -34,7 +34,7 @@ _OUTPUTS = {"linear": lambda mean: mean, "tanh": nn.tanh}
 # critic's errors (docs/results.md, "Why seeds were slow").
 _HIDDEN_GAIN = math.sqrt(2.0)
 _HEAD_GAIN = 0.01
-# Least standard deviation to divide an observation by: one that has hardly varied yet is magnified
+# Least standard deviation to divide an observation by. It magnifies a number that has hardly varied
 # by at most 1 / MIN_STD.
 MIN_STD = 1e-3
 # Huang et al. 2022, "The 37 Implementation Details of Proximal Policy Optimization",
@@ -43,12 +43,12 @@ OBSERVATION_LIMIT = 10.0
 
 
 class Sizes(NamedTuple):
-    """What a policy sees and does.
+    """Sizes of a policy's inputs and outputs.
 
     Attributes:
       observation: O, numbers of an observation.
       action: U, numbers of an action.
-      state: P, numbers that the critic sees in addition.
+      state: P, numbers that the critic sees beside the observation.
     """
 
     observation: int
@@ -129,14 +129,15 @@ class Normalizer:
         share = batch_count / jnp.maximum(count, 1.0)
         shift = batch_mean - self.mean
         spread = batch_variance + (1.0 - share) * shift**2
-        # The first batch replaces the variance of 1, from which a small one would lose digits.
+        # The first batch replaces the initial variance of 1: added to it, a small variance loses
+        # digits.
         before = jnp.where(share == 1.0, spread, self.variance)
         mean, mean_rest = _add(self.mean, share * shift + self.rest[0])
         variance, variance_rest = _add(before, share * (spread - before) + self.rest[1])
         return Normalizer(
             count=count,
             mean=mean,
-            variance=jnp.maximum(variance, 0.0),  # rounding may leave less
+            variance=jnp.maximum(variance, 0.0),  # rounding may make it negative
             rest=jnp.stack([mean_rest, variance_rest]),
         )
 
@@ -204,7 +205,7 @@ class Acted(NamedTuple):
 
 
 class _Network(nn.Module):
-    """The kinds of layers that both actor and critic have: from an observation to the features.
+    """The layers of both actor and critic, from an observation to the features.
 
     The heads take the features. Actor and critic do not share weights.
 

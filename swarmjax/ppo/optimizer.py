@@ -10,7 +10,7 @@ from swarmjax.ppo.config import AlgoConfig
 # swarm worse").
 _RATES = {"actor": 3e-4, "critic": 1e-3}
 _FULL_RATE_STEPS = 15_000
-# Mean over the run of the factor that a schedule applies to a rate.
+# Mean over the run of the factor by which a schedule multiplies a learning rate.
 _MEAN_OF_SCHEDULE = {"constant": 1.0, "linear": 0.5}
 
 

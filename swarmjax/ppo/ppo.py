@@ -39,8 +39,8 @@ class LearnerState:
       optimizer_state: State of the optimiser, `PPO.learning.optimizer`.
       normalizer: Moments of the valid observations of all updates so far. A learner that does not
         normalise keeps the initial moments.
-      explored: [], int32, control steps that the schedule of exploration has counted, at most
-        2^31 - 1; None if exploration is learned.
+      explored: [], int32, control steps that the exploration schedule has counted, at most 2^31 -
+        1; None if exploration is learned.
     """
 
     params: Params
@@ -142,7 +142,7 @@ class PPO:
         Args:
           learner: the learner with the critic.
           observation: [..., O], raw.
-          state: [..., P], numbers of order 1 that the critic sees in addition; () if there are
+          state: [..., P], numbers of order 1 that the critic sees beside the observation; () if
             none.
           memory: [..., H], the critic's memory before the observation; () without memory.
 
@@ -330,7 +330,7 @@ def _gather(samples: Batch, rows: jax.Array, config: AlgoConfig) -> Batch:
 
 
 def _shuffle(key: jax.Array, groups: int, minibatches: int, shards: Shards) -> jax.Array:
-    """Deals this device's G groups out to minibatches, [M, G / M], within each random stream."""
+    """Distributes the device's G groups over minibatches, [M, G / M], within each random stream."""
     streams = shards.local_streams
     size = groups // streams
 

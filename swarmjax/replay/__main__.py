@@ -2,7 +2,7 @@
 
 Runs the episodes in MuJoCo's C engine, as `evaluate` does, and writes one HTML file that plays them
 in a browser. `video=FILE.mp4` also renders them in 3-D. Two policies are shown side by side on the
-same levels. No JAX.
+same levels. Needs no JAX.
 
 Examples:
   # level 0 of its last stage, into replay.html
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str]) -> int:
     sys.stdout.writelines(f"{episode.label}\n" for episode in episodes)
     words.say(f"{out}: {len(page) / 1e6:.2f} MB.")
     if video:
-        words.say(f"{video}: the same, {video.stat().st_size / 1e6:.2f} MB.")
+        words.say(f"{video}: the same episodes, {video.stat().st_size / 1e6:.2f} MB.")
     return 0
 
 

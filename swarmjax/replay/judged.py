@@ -14,14 +14,14 @@ from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.trials import Entrant, Trial
 from swarmjax.replay.config import ReplayConfig
 
-RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # these order episodes
+RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # `worst` ranks by these
 
 
 def find(settings: ReplayConfig, entrant: Entrant, suite: Suite) -> tuple[str, list[Trial]] | None:
     """Looks for a policy's results in the files of an evaluation.
 
-    Looks in the folder of the policy file and in the folder of the page, and in their subfolders
-    one level down.
+    Looks in the folder of the policy file and in the folder of the page, and in their direct
+    subfolders.
 
     Args:
       settings: The replay's settings.

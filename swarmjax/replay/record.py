@@ -1,4 +1,4 @@
-"""Records episodes step by step in the judge, which is MuJoCo's C engine.
+"""Runs episodes in MuJoCo's C engine, and records them step by step.
 
 JAX is needed only to measure shortest paths.
 """
@@ -127,7 +127,8 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
     arenas = engine_c.start(judge, levels)
     yaw, poses = arenas.factors.infrared_yaw, judge.config.robot.sensor_poses
     frames = [_look(judge, arenas)]
-    # With `task.arrival=hold`, robots may leave their targets again, but an episode stays over.
+    # With `task.arrival=hold`, robots may leave their targets again, but an episode that is over
+    # stays over.
     over = np.zeros(len(levels), bool)
     memory = policy.begin(judge.policy, arenas.pose.shape[:2])
     while len(frames) <= judge.config.step_limit and not over.all():
@@ -217,7 +218,7 @@ def _since(arrived: np.ndarray) -> np.ndarray:
 
     It is 0 for a robot that has not arrived in the last row.
     """
-    away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
+    away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside the target
     return np.where(arrived[-1], away + 1, 0)
 
 

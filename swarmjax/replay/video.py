@@ -178,7 +178,7 @@ def _add_fixtures(spec: mujoco.MjSpec, recording: Recording) -> None:
 
 
 def _add_robot(spec: mujoco.MjSpec, radius: float, colour: list[float]) -> None:
-    """Adds a robot: its hull with an arrow ahead."""
+    """Adds a robot: its hull, with an arrow that points ahead."""
     body = spec.worldbody.add_body(mocap=True)
     half, top = 0.5 * (epuck.HULL_TOP - epuck.HULL_BOTTOM), epuck.HULL_TOP
     _add(body, _CYLINDER, [radius, half, 0], [0, 0, half + epuck.HULL_BOTTOM], colour)

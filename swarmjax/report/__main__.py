@@ -1,10 +1,9 @@
 """`python -m swarmjax.report run=DIR|runs=DIR,... [out=DIR]`: reports the results of runs.
 
 For one run it writes its figures, and `report.html`, which holds all of them. The run may still be
-going or may have been killed: the report leaves out a line that is not fully written. No JAX.
+going or may have been killed: the report leaves out a line that is not fully written. Needs no JAX.
 
-For several runs it prints a table and draws their success over each other: see `table` and
-`comparison`.
+For several runs it prints a table, and draws their success into the same panels.
 
 Examples:
   # into runs/first/report

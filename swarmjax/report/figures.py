@@ -57,7 +57,7 @@ def mix(history: History) -> Figure:
         colors=colours(len(history.names)),
         step="pre",
         linewidth=0,
-        antialiased=False,  # else the background shows between two bands
+        antialiased=False,  # hides the background between two bands
     )
     panel.set_ylim(0, 1)
     seeds = len(history.seeds)

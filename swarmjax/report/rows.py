@@ -25,7 +25,7 @@ from swarmjax.task.goals.goal import MEASURED
 
 Row = dict[str, Any]
 
-# Keys of lists with one number per stage, from the newest full group of episodes on that stage.
+# Keys of lists with one number per stage, from the newest cohort of episodes on that stage.
 BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
 _LISTS = ("mix", *BY_STAGE)
 # Keys with one number per update. The first two cover the episodes that ended in the update.
@@ -137,7 +137,7 @@ def read(run: Path) -> History:
     by_seed = _read_metrics(run, len(trained.stage))
     updates = sorted(set.intersection(*map(set, by_seed.values()))) if by_seed else []
     if not updates:
-        raise ConfigError(f"{run / METRICS} has no update of every seed: train it first.")
+        raise ConfigError(f"{run / METRICS} has no update that every seed recorded: train first.")
     seeds = sorted(by_seed)
     rows = [[by_seed[seed][update] for update in updates] for seed in seeds]
     lists, curves = (

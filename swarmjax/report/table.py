@@ -1,7 +1,7 @@
-"""Compares several runs in a table, one line per group of equal settings. No JAX.
+"""Compares several runs in a table, one line per group of equal settings. Needs no JAX.
 
 A line may hold one run with several seeds, or several runs with one or more seeds each, as the jobs
-of an array write them. Success is the last stage's newest verdict.
+of an array write them. Success is that of the newest whole cohort on the last stage.
 """
 
 import itertools
@@ -111,7 +111,7 @@ def read(runs: Sequence[Path]) -> list[Group]:
     for run in runs:
         history = rows.read(run)
         shared = {k: v for k, v in to_dict(history.config).items() if k not in _APART}
-        shared["run"] = {"stop_at": history.config.run.stop_at}  # a run that stops early differs
+        shared["run"] = {"stop_at": history.config.run.stop_at}  # this key may end runs early
         shared["stage"] = {stage["name"]: stage for stage in shared["stage"]}
         groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
@@ -218,7 +218,7 @@ def text(lines: Sequence[TableLine]) -> str:
             written.append("  ".join(map(str.ljust, parts, widths)).rstrip())
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
-        f"Success: {measures} on the last stage, over its newest episodes begun together; mean "
-        f"over seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
+        f"Success: {measures} on the last stage, over its newest episodes that began together. "
+        f"Mean over seeds, with its 95 % bootstrap interval for {LEAST_DRAWN} seeds or more."
     )
     return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])

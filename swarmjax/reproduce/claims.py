@@ -23,7 +23,8 @@ from swarmjax.reproduce.criteria import Criterion, about, crowded, earlier, high
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, PAIR, TUNED, Reproduction
 
-# Share of targets reached that counts as the desired behaviour; also promotes from a stage.
+# Share of targets reached that counts as the desired behaviour, and that promotes to the next
+# stage.
 GENERATED = 0.8
 FAILED = 0.5  # a swarm fails if it reaches a smaller share of its targets
 HELD = {True: "holds", False: "contradicted", None: "open"}
@@ -148,11 +149,11 @@ def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
 
     Args:
       stage: uses only the episodes of this stage; None for all.
-      axis: unit in which places are counted.
+      axis: whether to count training in episodes or in arena control steps.
 
     Returns:
-      For each reading: the goal, what is counted, and a function that finds an arm's places by
-      seed.
+      For each reading: the goal, what is counted, and a function that finds where each seed of an
+      arm reaches the goal.
     """
     which = "all episodes" if stage is None else f"episodes on {stage}"
     counted = f"{which}, {measures.UNITS[axis]}"
@@ -169,7 +170,8 @@ def _steady(stage: str | None, axis: Axis) -> list[Source]:
 def _rewarded() -> list[Source]:
     """Lists the ways to find where the reward on the last stage nears its best value.
 
-    There are two, for the reward of robot 1 and for the mean reward, in each unit of the place.
+    There are four: by the reward of robot 1 or by the mean reward, counted in episodes or in arena
+    control steps.
     """
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
     return [

@@ -14,7 +14,7 @@ from swarmjax.reproduce.measures import NUMBER, PLACE, SHARE, Unit
 # (None if undecided), and the numbers as text.
 type Criterion = Callable[..., tuple[bool | None, str]]
 
-ABOUT = 0.5  # we read "approximately a number" as: at most this share of the number away from it
+ABOUT = 0.5  # we read "approximately X" as X plus or minus this share of X
 # A difference is found with a probability of 0.8 if it is (1.96 + 0.84) standard errors from 0. The
 # 95 % interval is 2 * 1.96 standard errors wide.
 _POWER = (1.96 + 0.84) / (2 * 1.96)
@@ -37,7 +37,7 @@ def within(
 
 
 def about(number: float) -> Criterion:
-    """Makes the criterion that a place is approximately this number."""
+    """Makes the criterion that values, such as episode numbers, are approximately this number."""
     return partial(within, low=(1 - ABOUT) * number, high=(1 + ABOUT) * number, unit=PLACE)
 
 
@@ -65,7 +65,7 @@ def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | 
 
 
 def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
-    """Tests whether the first arm reaches a goal earlier, where inf means never.
+    """Tests whether the first arm reaches a goal earlier; inf stands for never.
 
     The test estimates the probability that a seed of the first arm is earlier than a seed of the
     second arm. The claim holds if the interval of this probability lies above 0.5. It is

@@ -14,7 +14,7 @@ from swarmjax.evaluate.statistics import Interval
 from swarmjax.reproduce.rows import Action, Reproduction, RunLog
 
 WINDOW = 20  # episodes of a rolling mean: "an averaging window of 20 values" (Figure 7)
-STEADY = 0.8  # share of successes in a steady window; the same share promotes from a stage
+STEADY = 0.8  # share of successes in a steady window; the same share promotes to the next stage
 KEPT = 0.5  # a later window below this share ends the steady state; see `steady` for why not 0.8
 
 type Axis = Literal["episode", "steps"]
@@ -119,7 +119,7 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
 
 
 def along(log: RunLog, axis: Axis) -> np.ndarray:
-    """Returns the place of each episode [E]: its number in the run, or arena steps at its end."""
+    """Returns where each episode [E] is in the run: its number, or the arena steps at its end."""
     return log.number if axis == "episode" else log.arena_steps
 
 
@@ -132,7 +132,7 @@ def steady_at(
       data: the reproduction's data.
       arm: a finished arm.
       success: takes [E] successes from a log.
-      axis: unit in which places are counted from the beginning of the run.
+      axis: whether to count training in episodes or in arena control steps.
       stage: uses only the episodes of this stage; None for all.
 
     Returns:
@@ -172,8 +172,8 @@ def judged(
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     """Counts how many more steps with something in range the last robot had than the first robot.
 
-    First and last are meant by arrival. The first robot finds no other robot at the targets. The
-    last robot finds all the others that have arrived.
+    First and last refer to the order of arrival. The first robot finds no other robot at the
+    targets, and the last robot finds all others that arrived.
 
     Args:
       data: the reproduction's data.
@@ -205,7 +205,7 @@ def reward_reached(
       data: the reproduction's data.
       arm: one of the rivals.
       of: takes the reward [E] from a log.
-      axis: unit in which places are counted from the beginning of the run.
+      axis: whether to count training in episodes or in arena control steps.
       rivals: finished arms. The best rolling mean is the highest one of all their seeds.
       stage: uses only the episodes of this stage.
 

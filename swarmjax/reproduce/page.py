@@ -92,10 +92,7 @@ def _mean(values: np.ndarray, unit: Unit) -> str:
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Writes the median and the interquartile mean of places, and how many seeds have a place.
-
-    A seed without a place has inf.
-    """
+    """Writes the median, the interquartile mean and the number of places; inf is no place."""
     return (
         PLACE.value(float(np.median(places))),
         _mean(places, PLACE),

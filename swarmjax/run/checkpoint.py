@@ -35,7 +35,7 @@ from swarmjax.run.errors import CheckpointError, TrainingError
 
 Leaves = dict[str, np.ndarray]
 
-KEPT = 2  # how many checkpoints are kept: the older one serves if the newest is damaged
+KEPT = 2  # how many checkpoints are kept: the older one is used if the newest is damaged
 FOLDER = hosts.CHECKPOINTS
 _STATE, _META, _SUMS = "state", "meta.json", "SHA256SUMS"
 _TEMPORARY = ".{}.tmp"  # the name of a folder while it is written or removed
@@ -137,7 +137,7 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any]) -> None:
         update = meta["update"]
         try:
-            if self._is_removed():  # writing would make the directory again
+            if self._is_removed():  # writing would recreate the directory
                 raise FileNotFoundError
             if _is_sound(leaves) and update not in steps(self._run):
                 self._write_folder(leaves, meta | self._owner)
@@ -186,7 +186,7 @@ class Checkpoints:
 
 def _orbax() -> Any:
     """Opens a `StandardCheckpointer` that waits for no other process of the run."""
-    import orbax.checkpoint as ocp  # takes a third of a second, here in the saving thread
+    import orbax.checkpoint as ocp  # this import takes a third of a second
 
     _silence()
     own = jax.process_index()
@@ -199,7 +199,7 @@ def _orbax() -> Any:
 
 @functools.cache
 def _silence() -> None:
-    """Silences Orbax's messages about a file that cannot be written: our own sentence says it.
+    """Silences Orbax's messages about a file that cannot be written: `Checkpoints` reports it.
 
     Orbax then closes its event loop, but TensorStore still reports the other files to this loop.
     """

@@ -59,7 +59,7 @@ def compile_chunk(
     fixed = program.config.run.deterministic
     call = lowered.compile(programs.compiler_options(deterministic=fixed))
     needed = call.memory_analysis()
-    assert needed is not None  # both CPU and GPU report it
+    assert needed is not None  # JAX reports it on CPU and GPU
     # The returned state reuses the memory of the donated state. Only the metrics need more memory.
     returned = needed.output_size_in_bytes - needed.alias_size_in_bytes
     each = needed.argument_size_in_bytes + needed.temp_size_in_bytes + returned

@@ -78,7 +78,7 @@ def _lock(run: Path, held: contextlib.ExitStack) -> None:
     file = held.enter_context((run / LOCK).open("a+"))
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not os.fstat(file.fileno()).st_nlink:  # removed by its holder between open and lock
+        if not os.fstat(file.fileno()).st_nlink:  # its holder removed it before we locked it
             raise BlockingIOError
     except BlockingIOError:
         file.seek(0)
@@ -87,14 +87,14 @@ def _lock(run: Path, held: contextlib.ExitStack) -> None:
             f"run.dir is {run}, but {holder} is writing to it: wait for its end, or give another "
             "directory."
         ) from None
-    with contextlib.suppress(OSError):  # a full disk; the lock works without a name
+    with contextlib.suppress(OSError):  # on a full disk; the lock works without this text
         file.truncate(0)
         file.write(f"process {os.getpid()}\n{socket.gethostname()}\n")
         file.flush()
 
 
 def claim(folder: Path, name: str) -> Path:
-    """Makes a new directory that no other process gets, even if it asks for the same name.
+    """Makes a new directory that no other process gets, even one that asks for the same name.
 
     Args:
       folder: parent of the new directory; it is made if it is missing.
@@ -120,14 +120,14 @@ def visible(run: Path) -> list[str]:
     """
     try:
         return sorted(each.name for each in run.iterdir() if not each.name.startswith("."))
-    except OSError:  # missing, or refused later where it is written
+    except OSError:  # missing or unreadable: writing it raises an error later
         return []
 
 
 def is_written(run: Path) -> bool | None:
     """Returns whether the process that last wrote a run directory still runs.
 
-    This does not try to acquire the lock, which would keep out a run that begins at that moment.
+    This does not try to acquire the lock: that could keep out a run that begins at that moment.
 
     Returns:
       Whether the process still runs; None if it was started on another machine.

@@ -119,7 +119,7 @@ def gather(tree: Any) -> Any:
 
 @contextlib.contextmanager
 def lost_peers() -> Iterator[None]:
-    """Replaces JAX's error about a lost process by one sentence.
+    """Replaces JAX's error about a lost process with one sentence.
 
     Raises:
       LostPeerError: if another process of the run is gone.
@@ -181,7 +181,7 @@ def _check_alike(settings: TrainConfig) -> None:
         for key in own
         if own[key] != theirs.get(key)
     ]
-    other = "another process has other settings or versions"  # than this one, which is process 0
+    other = "another process has other settings or versions"  # here, in process 0, nothing differs
     raise ConfigError(f"{differing[0] if differing else other}: give all processes the same.")
 
 

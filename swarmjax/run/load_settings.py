@@ -22,7 +22,7 @@ AUTO = "auto"  # `resume` accepts this word in place of a directory
 # The keys that a resumed run accepts. All other keys determine what the run has computed so far.
 _RESUME_KEYS = (*("run.*" if key == "run" else key for key in MAY_CHANGE), "extensions")
 
-# The algo keys that a run with init_from shares with the run that it starts from.
+# The keys of `algo` that a run with `init_from` takes from the run that it starts from.
 NETWORK_KEYS = (
     *("policy", "network", "hidden_sizes", "memory", "memory_size"),
     *("critic", "activation", "mean_activation"),
@@ -30,7 +30,7 @@ NETWORK_KEYS = (
 
 
 def from_stored(stored: Mapping[str, Any], where: str = "") -> TrainConfig:
-    """Makes the configuration that a run directory or a policy holds.
+    """Rebuilds the configuration that a run directory or a policy file holds.
 
     Its key `extensions` is left out: only a command line or Python may name code to execute.
 
@@ -121,7 +121,7 @@ def _grid(stages: list[dict[str, Any]], along: Any) -> list[dict[str, Any]]:
 def _inherited(cls: type[TrainConfig], typed: Sequence[str]) -> list[str]:
     """Returns the words that a run with `init_from` takes from the run that it starts from.
 
-    These words set robot, task, realism and the shape of the networks. Typed words override them.
+    These words set robot, task, realism and the shape of the networks. `typed` overrides them.
     """
     source = files.parse(cls, typed).get("init_from")
     if not isinstance(source, str):
@@ -134,7 +134,7 @@ def _inherited(cls: type[TrainConfig], typed: Sequence[str]) -> list[str]:
     if held.algo.memory == "none" or any(
         word.startswith(("algo.memory=", "algo=")) for word in typed
     ):
-        others.append("memory_size")  # this key belongs to the kind of memory that was typed
+        others.append("memory_size")  # the typed words choose the memory, and so its size
     return [
         *inherit.group_words(cls, "robot", held.robot, typed),
         *inherit.group_words(cls, "task", held.task, typed),
@@ -217,7 +217,7 @@ def _may_change(key: str) -> bool:
 
 
 def _kept_streams(streams: int | None, devices: Any, seeds_by: str) -> int | None:
-    """Returns a resumed run's number of streams: the stored one if its devices can share it."""
+    """Returns a resumed run's number of streams: the stored one if it fits the run's devices."""
     by_seeds = seeds_by == "devices"
     fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
     return streams if fits else None

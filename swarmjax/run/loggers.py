@@ -34,7 +34,7 @@ class Logger(Protocol):
     name: str
 
     def write(self, rows: Sequence[Row], speeds: Row) -> None:
-        """Receives the rows of a call of the program. Do not change them: others read them too.
+        """Receives the rows of a call. Do not change the rows: other loggers read them too.
 
         Args:
           rows: one for each update and seed, as `recorder.rows` makes them.

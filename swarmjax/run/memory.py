@@ -15,7 +15,7 @@ import jax
 from swarmjax.config import ConfigError
 from swarmjax.run.settings import TrainConfig
 
-MARGIN = 0.95  # factor on the proportional estimate: part of the memory does not grow with arenas
+MARGIN = 0.95  # safety factor: part of the memory does not grow with the number of arenas
 # Words with which XLA, CUDA, and Warp through CUDA report a failed allocation.
 _EXHAUSTED = ("RESOURCE_EXHAUSTED", "OUT_OF_MEMORY", "Failed to allocate")
 
@@ -59,7 +59,7 @@ def check(settings: TrainConfig, needed: int) -> None:
 
 @contextlib.contextmanager
 def refusal(settings: TrainConfig) -> Iterator[None]:
-    """Replaces JAX's out-of-memory error by one sentence.
+    """Replaces JAX's out-of-memory error with one sentence.
 
     Raises:
       ConfigError: in place of JAX's error. Every other error passes.

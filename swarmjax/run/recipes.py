@@ -1,6 +1,6 @@
 """Recipes: files that hold the settings of a whole run, for `recipe=NAME`.
 
-Recipes are made to be passed on, so they are data: `TrainConfig.shared` lists what they may set.
+People pass recipes on, so recipes hold only data. `TrainConfig.shared` lists what they may set.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from swarmjax.config import ConfigError, Section, files, reading, show
 
 
 def expand(cls: type[Section], typed: Sequence[str]) -> list[str]:
-    """Replaces `recipe=NAME` by the words of the recipe. Typed words override these.
+    """Replaces `recipe=NAME` with the words of the recipe. Typed words override these.
 
     A recipe may extend another recipe, which its key `recipe` names. The words of the extending
     recipe override those of the other.

@@ -1,4 +1,4 @@
-"""Writes a run's metrics, decisions and episodes to JSONL files and loggers while it trains."""
+"""Writes a run's metrics, curriculum decisions and episodes to JSONL files and loggers."""
 
 import contextlib
 import math
@@ -24,7 +24,7 @@ def rows(
     seeds: Sequence[int],
     control_steps: int,
 ) -> list[Row]:
-    """Turns the metrics of a call into one row for each update and seed.
+    """Turns the metrics of a call of the program into one row for each update and seed.
 
     Args:
       metrics: [N, rows, ...] as `seeds.chunk` returns them. The first n entries of each seed
@@ -69,7 +69,7 @@ def _row(raw: Row, stages: Sequence[str], control_steps: int) -> Row:
 
 
 def _finite(value: Any) -> Any:
-    """Replaces numbers that are not finite by None, since JSON has no such numbers."""
+    """Replaces numbers that are not finite with None, since JSON has no such numbers."""
     if isinstance(value, list):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -117,7 +117,7 @@ class Recorder:
         self._open = contextlib.ExitStack()
         names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
         self._logs = {name: self._open.enter_context(Log(run / name)) for name in names}
-        # A log that this process does not write still belongs to the run.
+        # Earlier starts of the run may have written logs that this start does not write.
         self._closed = {name: length for name, length in logs.items() if name not in names}
         self._loggers = [
             self._open.enter_context(contextlib.closing(Guarded(each))) for each in loggers

@@ -30,8 +30,8 @@ def write_policies(run: Path, settings: TrainConfig, leaves: Leaves, update: int
             raise TrainingError(str(error)) from None
 
 
-# Fewest episodes that decide on `run.stop_at`. If 95 of 100 episodes succeed, the exact 95 %
-# confidence interval of the success is 0.89 to 0.98.
+# Fewest episodes on the last stage before `run.stop_at` may end a run. If 95 of 100 episodes
+# succeed, the exact 95 % confidence interval of the success is 0.89 to 0.98.
 ENOUGH = 100
 
 

@@ -49,7 +49,7 @@ from swarmjax.training.loop import TrainState
 from swarmjax.training.rollout import Program
 
 CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's interval
-# There is a checkpoint at least after this share of the budget, so that a short run has some too.
+# Save a checkpoint at least once per this share of the budget, so that short runs have some too.
 BUDGET_SHARE = 0.1
 GROWTH = 4  # a call is at most this many times as long as the previous one
 PATIENCE = 10  # a run has diverged after this many updates in a row without learning
@@ -61,7 +61,7 @@ class Run:
     Attributes:
       settings: its config.
       path: its directory, once it is open.
-      program: the parts that fix the compiled program, once it is loaded.
+      program: the parts that determine the compiled program, once it is loaded.
       schedule: the curriculum's numbers, an argument of the program.
       state: [N] the training state.
       compiled: the program to call, once it is compiled.
@@ -92,7 +92,7 @@ class Run:
           loggers: receive the rows, beside the loggers that the config names.
           on_update: called with a copy of each row; it returns True to stop the run.
           keep_traces: whether to keep traced programs for later runs. Only for a new process: its
-            code is that of the files, whose digest is the key.
+            code is that of the files, and their digest is the key.
         """
         self.settings = settings
         self._stop = stop or Stop()
@@ -103,7 +103,7 @@ class Run:
         self._kept: Kept | None = None
         self._first, self._seconds, self._earlier_s = 0, 0.0, 0.0
         self._newest: list[Row] = []  # the last row of each seed
-        self._barren: Counter[int] = Counter()  # newest updates in a row that taught nothing
+        self._barren: Counter[int] = Counter()  # updates in a row without learning, by seed
         self._saved = (0.0, 0)  # time and update of the newest checkpoint
 
     def train(self) -> None:
@@ -161,7 +161,7 @@ class Run:
             raise outputs.unwritable("run.dir", Path("runs") / name, error) from None
 
     def _broken(self, error: OSError | TrainingError) -> TrainingError:
-        """Says why the run ends, and what is left of it."""
+        """Says why the run ends, and where its checkpoints are."""
         why = str(error)
         if isinstance(error, OSError):
             why = f"{self.path} cannot be written: {error.strerror or error}."
@@ -240,7 +240,7 @@ class Run:
         return self.update == self.settings.updates or self._has_reached()
 
     def _has_reached(self) -> bool:
-        """Returns whether `run.stop_at` ends the run here, which only the end of a cohort can."""
+        """Returns whether `run.stop_at` ends the run now, which is at the end of a cohort."""
         if self.settings.run.stop_at is None or self.update % int(self.schedule.cohort_updates):
             return False
         return bool(hosts.share(results.has_reached(self.settings, self._newest))[0])
@@ -261,10 +261,7 @@ class Run:
             raise outputs.unwritable("run.dir", self.path, error) from None
 
     def _train_chunks(self) -> None:
-        """Trains until the run has ended, `run.stop_after` is reached or a stop is requested.
-
-        A thread writes the checkpoints while training continues.
-        """
+        """Trains until the run has ended, `run.stop_after` is reached or a stop is requested."""
         options, logs = self.settings.run, {} if self._kept is None else self._kept.logs
         resumed = None if self._kept is None else self.update
         with (
@@ -305,7 +302,7 @@ class Run:
             elif self._seconds:
                 n = int(np.clip(CALL_SECONDS / self._pace, 1, GROWTH * n))
             most = min(goal - self.update, self.program.rows)
-            if settings.run.stop_at is not None:  # calls of any length then stop at the same update
+            if settings.run.stop_at is not None:  # end calls at the end of a cohort
                 cohort = int(self.schedule.cohort_updates)
                 most = min(most, cohort - self.update % cohort)
             yield int(hosts.share(min(n, most))[0])

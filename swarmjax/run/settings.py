@@ -49,8 +49,7 @@ class TrainConfig(ProgramConfig):
     """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
-    # What is trained. Which code runs, where it is written, what it starts from and who is called
-    # is decided by whoever starts the run.
+    # Keys that a recipe may set: they say what is trained. Whoever starts the run sets all others.
     shared: ClassVar[tuple[str, ...]] = (
         *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
         *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),

@@ -56,7 +56,7 @@ def keep(
         return jitted
     shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
     fast = dispatch.load_fast("arenas_warp", program.world.physics.engine.impl)
-    before = [] if fast is None else list(fast.CALLS)  # the next trace counts on from these
+    before = [] if fast is None else list(fast.CALLS)  # the next trace adds to these
     # Pickled call by call, because `pickle` writes what calls share only once, and a call that was
     # repeated shares other things than a call that was traced.
     calls = [pickle.dumps(solve) + repr(given).encode() for solve, given in before]

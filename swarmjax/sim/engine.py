@@ -20,7 +20,7 @@ OTHERS_PER_ROBOT = 3
 # size at once.
 ROWS_PER_ROBOT = 6
 _STARTING = threading.Lock()  # `train` starts Warp in a thread; two starts would create Warp twice
-FEW_ARENAS = 64  # up to this number of arenas, every pair of geoms gets memory: all may be crowded
+FEW_ARENAS = 64  # in so few arenas, every pair of geoms gets memory
 
 # Model and data of MJX (in either implementation), or of a faster engine that uses the same field
 # names.
@@ -103,7 +103,7 @@ def start_warp() -> None:
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
-    """Returns how many contacts of all arenas and solver rows of each arena Warp has memory for."""
+    """Returns Warp's memory: contacts in all arenas together, and solver rows in each arena."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = _rows(model)
     of_world = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any(axis=0)

@@ -1,4 +1,4 @@
-"""Computes signed gaps between hulls and the objects around them, and counts contacts by them."""
+"""Computes signed gaps between hulls and the objects around them, and counts contacts."""
 
 from typing import Any
 

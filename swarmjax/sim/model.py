@@ -56,7 +56,7 @@ class Ids(NamedTuple):
         obstacles and walls are geoms of the world.
       obstacle_geom: [M] the first M entries of `fixture_geom`.
       hull_body: [R] rows of the hulls' bodies, for a ray's `bodyexclude`.
-      robots: rows of the robots' parts.
+      robots: rows that belong to each robot.
     """
 
     fixture_geom: np.ndarray

@@ -60,7 +60,7 @@ def look(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near | None:
 
 
 def find(pose: Array, hull_radius: float, limit: float, xp: Any) -> Near:
-    """Lists for each robot at least all robots whose hulls are within `limit` of its own hull.
+    """Lists for each robot all robots with hulls within `limit` of its own, and perhaps others.
 
     Args:
       pose: [R, 3] x (m), y (m), yaw (rad); absent robots are parked far away from each other.

@@ -1,4 +1,4 @@
-"""Counter-based random numbers: each number is a hash of its purpose and time, without any state.
+"""Counter-based random numbers: each is a hash of its seed, time and purpose; there is no state.
 
 The same seed, clock, stream and index give the same number in NumPy and in JAX. A level with all
 its randomness therefore replays exactly. These numbers are not secure: do not use them for secrets.

@@ -94,7 +94,7 @@ def read(
     xp: Any,
     table: Table = EPUCK,
 ) -> Array:
-    """Reads the sensors.
+    """Simulates the readings of the sensors.
 
     Args:
       response: sensor model.

@@ -7,7 +7,7 @@ from swarmjax.config import ConfigError, show
 
 Pose = tuple[float, float, float]  # x (m), y (m), yaw (rad)
 Point = tuple[float, float, float]  # ray length (m), value, relative deviation
-MOST = 32  # most sensors of a robot; a lidar, with more rays, needs other code
+MOST = 32  # most sensors of a robot; a lidar has more rays and needs other code
 MOST_YAW = 6.2832  # rad; a full turn
 MOST_VALUE = 1e6  # largest counts of a sensor
 _ROUNDING = 1e-9  # m; rounding error allowed, as a sensor may sit exactly on the hull's surface

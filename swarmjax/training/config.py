@@ -1,4 +1,4 @@
-"""The settings that fix the compiled program of a run."""
+"""The settings that determine the compiled program of a run."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -19,7 +19,7 @@ STEPS_PER_EPISODE = 32
 
 @dataclass(frozen=True, kw_only=True)
 class ProgramConfig(Section):
-    """The settings that fix the compiled program. A subclass adds the settings of a command."""
+    """The settings that determine the compiled program. A subclass adds a command's settings."""
 
     stage: tuple[StageConfig, ...]
     robot: RobotConfig = field(default_factory=RobotConfig)

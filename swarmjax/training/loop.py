@@ -196,7 +196,7 @@ def _draw(
 def _curriculum_metrics(
     config: ProgramConfig, before: CurriculumState, after: CurriculumState
 ) -> Metrics:
-    """Reports the decision, the weights after the decision, and the record of each stage."""
+    """Reports the decision, the stages' weights after it, and the record of each stage."""
     record, stage = after.cohorts.record, before.chosen.stage
     return {
         "decision": after.chosen.reason,

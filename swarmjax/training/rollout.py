@@ -32,7 +32,7 @@ from swarmjax.training.config import ProgramConfig
 
 @dataclass(frozen=True, eq=False)
 class Program[C: ProgramConfig]:
-    """The parts that fix the compiled program; `program.py` builds them.
+    """The parts that determine the compiled program; `program.py` builds them.
 
     Attributes:
       config: settings of the program.

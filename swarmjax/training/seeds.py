@@ -28,9 +28,9 @@ def each(function: Callable[..., Any], schedule: Any, lanes: Any, *rest: Any) ->
     """Applies a function of one seed to all seeds of a call, side by side.
 
     The matrix products of several seeds are batched. Batched products round differently from those
-    of a run of one seed, but in the same way for every seed. One seed alone is not batched.
-    With `seeds_by=cores`, a call has one group of seeds; with `devices`, a call has the seeds of
-    one device.
+    of a run of one seed, but in the same way for every seed. The products of a single seed are not
+    batched. With `seeds_by=cores`, a call has one group of seeds; with `devices`, a call has the
+    seeds of one device.
 
     Args:
       function: takes `schedule`, one seed's part of `lanes`, and `rest`; returns a tree.

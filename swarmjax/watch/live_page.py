@@ -61,7 +61,7 @@ class LivePage:
             return report_page.page(history=self.history, figures=self.figures, **about)
 
     def _draw(self) -> None:
-        """Draws the figures if the run has logged more, unless drawing must rest."""
+        """Draws the figures if the run has logged more, unless the last drawing is too recent."""
         metrics, began = self.run / METRICS, time.monotonic()
         written = metrics.stat().st_size if metrics.exists() else 0
         if written in (0, self._drawn) or began < self._rests_until:
@@ -71,7 +71,7 @@ class LivePage:
         try:
             self.history = rows.read(self.run)
             self.figures, self.trouble = figures.png_files(self.history), ""
-        except (ConfigError, OSError) as error:  # for example, the run was removed meanwhile
+        except (ConfigError, OSError) as error:  # for example, somebody removed the run
             self.trouble = str(error)
         now = time.monotonic()
         self._drawn, self._rests_until = written, now + (now - began) * (1.0 - SHARE) / SHARE

@@ -20,7 +20,7 @@ BOMB = "\n".join(
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        (BOMB, "replace the YAML alias *a0 by its value"),
+        (BOMB, "replace the YAML alias *a0 with its value"),
         ("a: &a [*a]", "replace the YAML alias *a"),
         ("[" + "1," * 10_001 + "]", "has more than 10000 values"),
         ("a: " + "[" * 100_000, "lists or mappings are nested more than 32 deep"),

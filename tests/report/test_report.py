@@ -69,7 +69,7 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
         (["run=gone"], "gone is not a run directory: it has no config.json."),
         (["run=cut"], "cut/metrics.jsonl in line 1 is damaged: resume the run, or remove"),
         (["run=text"], "text/metrics.jsonl in line 1 has no number as train_s: it is damaged."),
-        (["run=empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
+        (["run=empty"], "empty/metrics.jsonl has no update that every seed recorded: train first."),
         (["run=good", "out=file"], "out is file, which cannot be written: File exists."),
         ([], "run is missing: give run=DIR, or runs=DIR,DIR,... to compare."),
         (
@@ -81,7 +81,10 @@ def test_a_report_of_a_run_that_was_killed_leaves_its_unfinished_line_out(
         (["runs=good,good"], "good and good have the same settings and share a seed: "),
         (["runs=good,,cut"], "runs is 'good,,cut', but '' names neither a run nor a "),
         (["runs=good,same"], "good and same have the same settings and share a seed: "),
-        (["runs=good,empty"], "empty/metrics.jsonl has no update of every seed: train it first."),
+        (
+            ["runs=good,empty"],
+            "empty/metrics.jsonl has no update that every seed recorded: train first.",
+        ),
         (["runs=good", "out=file"], "out is file, which cannot be written: File exists."),
     ],
 )

@@ -98,8 +98,12 @@ def test_a_file_that_is_not_there_is_named(file: str, what: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("file", "content", "what"),
     [
-        ("metrics.jsonl", "", " has no update of every seed: train it first."),
-        ("metrics.jsonl", '{"seed": 0, "upd', " has no update of every seed: train it first."),
+        ("metrics.jsonl", "", " has no update that every seed recorded: train first."),
+        (
+            "metrics.jsonl",
+            '{"seed": 0, "upd',
+            " has no update that every seed recorded: train first.",
+        ),
         ("metrics.jsonl", '{"seed": 0, "upd\n{}\n', " in line 1 is damaged: resume the run"),
         ("metrics.jsonl", "[]\n", " in line 1 is damaged: resume the run, or remove the line."),
         ("metrics.jsonl", "[" * 10**5 + "\n", " in line 1 is damaged: resume the run"),

@@ -129,7 +129,7 @@ def valid_first(samples: Batch) -> Batch:
     within = jnp.cumsum(samples.valid, axis=1, dtype=jnp.int32)
     before = jnp.cumsum(within[:, -1]) - within[:, -1]
     index = jnp.arange(groups * each, dtype=jnp.int32)
-    beyond = groups * each + index  # dropped, as out of range; distinct for unique_indices
+    beyond = groups * each + index  # out of range, so dropped; distinct for `unique_indices`
     place = jnp.where(samples.valid.ravel(), (before[:, None] + within - 1).ravel(), beyond)
     source = jnp.zeros_like(index).at[place].set(index, mode="drop", unique_indices=True)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[source], samples)

@@ -145,7 +145,7 @@ def layouts(params: Params) -> dict[str, KernelLayout]:
 def shuffle(
     keys: jax.Array, samples: int, valid: jax.Array, minibatches: int, launch: Launch
 ) -> Tiles:
-    """Deals the tiles that hold valid samples out to minibatches, as evenly as possible.
+    """Distributes the tiles that hold valid samples over minibatches, as evenly as possible.
 
     If there are fewer such tiles than minibatches, some minibatches get none.
 
@@ -214,7 +214,7 @@ def flat_gradient(
     actor, surrogate = run("actor", surrogate_loss)
     critic, error = run("critic", _half_square)
     count = error.pop("valid")
-    weight = count * share  # weight in the mean of a term that all samples share
+    weight = count * share  # weight of a term that is equal for all samples
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}

@@ -1,4 +1,4 @@
-"""A kernel that takes samples through a network and a loss, and gradients back, on the chip.
+"""A GPU kernel that runs samples through a network and a loss, and backpropagates, on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
 keeps the activations of a tile of samples on the chip. A program writes only sums, when it ends.
@@ -29,7 +29,7 @@ MOST_WIDTH = 128
 # counts what the matrix products of capability 9.0 take; those of other capabilities take up to 4
 # KiB more.
 SHARED_MEMORY = 95 * 1024
-# The same for chips where a program may use more, by compute capability; from the same source.
+# The same limit, by compute capability, of chips that allow more; from the same source.
 _MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 
@@ -187,7 +187,7 @@ def sums(
         functools.partial(_program, of_tile, shapes, layout, launch.tile),
         grid=(programs,),
         out_shape=jax.ShapeDtypeStruct((programs * width,), jnp.float32),
-        # Prefetching does not pay: a tile's samples are few bytes compared with its products.
+        # Prefetching saves no time: loading a tile's samples is little work beside its products.
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
     )(parameters, samples, tiles)
     total = jnp.sum(totals.reshape(programs, width), axis=0)

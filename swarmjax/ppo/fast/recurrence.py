@@ -1,4 +1,4 @@
-"""Kernels that take a GRU through sequences, and its gradient back, on the chip.
+"""GPU kernels that run a GRU through sequences, and backpropagate, on the chip.
 
 XLA launches several kernels for each step of a sequence, and passes data between them through the
 GPU's memory. Here a program of the grid holds a tile of sequences and their memory, and runs all
@@ -30,7 +30,7 @@ MOST_SMALL = 8192
 _WARPS, _BACKWARD_WARPS = 4, 8
 # Steps that the backward pass has in flight: it loads the inputs of the next steps while it
 # computes one. On an H100, the backward pass then takes 0.56 to 0.64 of its time without this. The
-# forward pass became slower, so it has one step in flight.
+# forward pass has one step in flight, because more made it slower.
 _STAGES = 3
 # Type of the GRU's inputs and of their gradient, which are the largest arrays. With half as many
 # bytes as float32, training took 8 % less time on an H100. The rollout rounds in the same way, so

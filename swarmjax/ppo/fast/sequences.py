@@ -23,9 +23,9 @@ from swarmjax.shards import ALONE, Shards
 # Sequences of a tile on a CPU. Tiles of 32 take no longer than whole minibatches if all robots are
 # present, and are still well filled if few robots are present.
 CPU_TILE = 32
-# Fewest and most samples of a tile on an accelerator, summed over all learners side by side. An
-# accelerator runs the control steps one after the other, so a large tile takes little longer than a
-# small one. With default layers, the largest tile takes about 12 GB.
+# Fewest and most samples of a tile on an accelerator, summed over all learners trained side by
+# side. An accelerator runs the control steps one after the other, so a large tile takes little
+# longer than a small one. With default layers, the largest tile takes about 12 GB.
 TILE_SAMPLES = 2**17, 2**21
 # Fewest sequences that the memory kernels compute at once.
 FEWEST_SEQUENCES = 16
@@ -88,9 +88,9 @@ def arrange(samples: Batch, steps: int) -> Batch:
 def deal(
     key: jax.Array, useful: jax.Array, minibatches: int, shards: Shards = ALONE
 ) -> tuple[jax.Array, jax.Array]:
-    """Deals the sequences with a valid sample out to minibatches at random.
+    """Distributes the sequences with a valid sample over minibatches at random.
 
-    Each stream of random numbers deals its own sequences out, as evenly as possible, so that a
+    The sequences of each stream of random numbers are distributed as evenly as possible, so that a
     minibatch holds the same sequences on any number of devices. If a stream has fewer sequences
     than there are minibatches, the last minibatches get no sequence of this stream.
 

@@ -15,7 +15,7 @@ from jax import Array
 # Distance from the origin, in cells. Along each axis, all places beyond this distance share one
 # cell. Up to this distance, float32 rounds to less than 1 % of a cell.
 _FAR = wp.constant(32768.0)
-_PER_ROBOT = 2.0  # each axis has at least this many cells times the square root of the robots
+_PER_ROBOT = 2.0  # least cells of an axis, divided by the square root of the number of robots
 
 
 def chain(place: Array, width: float) -> tuple[Array, Array]:

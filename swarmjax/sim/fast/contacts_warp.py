@@ -11,8 +11,8 @@ arena has one thread.
 
 Comparing all pairs of many robots would take too long. With more than `MANY` robots, a first kernel
 therefore lists the contacts: one thread for each obstacle, wall and robot looks for robots in the
-cells around it (`cells_warp`). The list has the same order. The threads of the arena then only
-solve for the forces.
+cells around it (`cells_warp`). Both ways list the contacts in the same order. The threads of the
+arena then only solve for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """

@@ -56,7 +56,7 @@ def list_by_cells(
     def run(start: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
         return call(*given, start, launch_dims=owners, output_dims={"contact": shape})
 
-    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # no room to list any
+    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # there is no memory for contacts
     end = jnp.cumsum(count, axis=1)
     return end[:, -1], run(end - count, shape)[1]
 
@@ -314,7 +314,7 @@ def _from_box(place: wp.vec3, box: WarpBox, radius: float) -> wp.vec3:
         along = wp.where(over_x > over_y, wp.vec2(1.0, 0.0), wp.vec2(0.0, 1.0))
         distance = wp.where(depth > _DEEPEST, radius, -depth)
     along = wp.normalize(along)
-    # A centre midway between two faces is pushed out through the face at the negative end.
+    # A centre midway between two faces is pushed out through the face on the negative side.
     along_x = wp.where(x > 0.0, along[0], -along[0])
     along_y = wp.where(y > 0.0, along[1], -along[1])
     world_x = box.cos * along_x - box.sin * along_y

@@ -165,7 +165,7 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
 
     The gap is measured from the box's point nearest to the hull's centre. A centre within the box
     has no such point, so its gap is measured from the nearest face, unless that face is the top or
-    the bottom.
+    the bottom (`discs.DEEPEST`).
     """
     x, y = to_box_frame(x - box.x, y - box.y, box)
     over_x, over_y = jnp.abs(x) - box.half_x, jnp.abs(y) - box.half_y
@@ -173,7 +173,7 @@ def _from_box(x: Array, y: Array, box: Box, radius: float) -> DiscGap:
     along_x = jnp.where(within, jnp.where(over_x > over_y, 1.0, 0.0), jnp.maximum(over_x, 0.0))
     along_y = jnp.where(within, jnp.where(over_x > over_y, 0.0, 1.0), jnp.maximum(over_y, 0.0))
     length = jnp.sqrt(along_x * along_x + along_y * along_y)
-    # A centre midway between two faces is pushed out through the face at the negative end.
+    # A centre midway between two faces is pushed out through the face on the negative side.
     along_x = jnp.where(x > 0.0, along_x, -along_x) / length
     along_y = jnp.where(y > 0.0, along_y, -along_y) / length
     depth = -jnp.maximum(over_x, over_y)

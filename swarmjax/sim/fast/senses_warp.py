@@ -2,8 +2,8 @@
 
 The results equal those of `infrared` and `gaps`. A thread computes rays and gaps of one robot. It
 looks only at other robots in the cells around this robot (`cells_warp`), and skips boxes that are
-too far away. XLA would compute each ray to each box, and would sort the robots to list those near
-each robot.
+too far away. XLA would intersect each ray with each box, and would sort the robots to list those
+near each robot.
 """
 
 # Warp's types know neither the arguments of a struct nor those of an array.

@@ -3,8 +3,8 @@
 `wheeled_warp` describes the problem, and solves it for the robots that touch no other robot.
 
 Newton's step solves H x = -g. The Hessian H is a block of 8 x 8 per robot, P, plus a term of rank
-one per active contact between two robots. Conjugate gradients with the preconditioner P solve it in
-as many steps as there are such contacts, and one (Golub and Van Loan 2013, "Matrix Computations",
+one per active contact between two robots. With the preconditioner P, conjugate gradients take at
+most one step more than there are such contacts (Golub and Van Loan 2013, "Matrix Computations",
 11.3.2 and 11.5.2). On a GPU, each robot has a thread of its own, and threads of an arena share a
 CUDA warp.
 """

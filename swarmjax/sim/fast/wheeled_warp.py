@@ -14,7 +14,7 @@ If robots touch only the floor, walls and obstacles, each row of M and J involve
 problem then splits into one problem per robot, with 8 unknowns. MJX-Warp's Newton method instead
 solves for all robots of an arena together, and factorises a matrix of 8 R rows per iteration.
 
-Here, only robots that touch each other are solved together (`wheeled_pairs`).
+This solver solves robots together only if they touch each other (`wheeled_pairs`).
 """
 
 import copy
