@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
 from swarmjax.extension import Network
 
-# Options that are read only with some choices of another key: by option, that key and the choices.
+# Some options are read only if another key has certain values: by option, that key and the values.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     "gae_lambda": ("advantage", ("gae",)),
     "memory_size": ("memory", ("gru",)),
@@ -22,8 +22,8 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 class AlgoConfig(Section):
     """Settings of PPO; names in quotes are those in Table 1 of the paper.
 
-    Some options are read only with one choice of another key. Their texts end with this key and
-    choice, in brackets.
+    Some options are read only if another key has a certain value. Their descriptions end with
+    `[key=value]`.
     """
 
     name: Literal["ppo", "paper"] = setting(

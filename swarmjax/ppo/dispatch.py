@@ -18,9 +18,8 @@ _LEAST_GENERATION = 8
 # (`jax.default_matmul_precision`).
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block.
-# fused: GPU kernels. sequences: autodiff of a policy with memory, without the sequences of absent
-# robots.
+# autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block. fused:
+# GPU kernels. sequences: autodiff of a policy with memory, which leaves out absent robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
 Learn = Callable[[Learning, Progress, Batch, jax.Array], tuple[Progress, Metrics]]
 
@@ -41,7 +40,7 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
       The backend.
     """
     auto = config.update_backend == "auto"
-    if config.memory != "none":  # other faster ways ignore the order of samples
+    if config.memory != "none":  # the other backends ignore the order of samples
         return "sequences" if auto else "autodiff"
     if auto and _fuses(config, networks, sizes):
         return "fused"
@@ -68,7 +67,7 @@ def memory_kernels(config: AlgoConfig) -> Any:
 
 
 def find(backend: Backend) -> Learn:
-    """Returns the function of `ppo/fast/` that learns with a backend other than autodiff."""
+    """Returns the function of `ppo/fast/` that learns with a given backend, except `autodiff`."""
     return importlib.import_module(f"swarmjax.ppo.fast.{backend}").learn
 
 

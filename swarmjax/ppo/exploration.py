@@ -22,7 +22,7 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
     stds = [config.initial_std]
     while stds[-1] > config.std_floor:
         lower = round(stds[-1] - config.std_decrement, 4)
-        # Rounding can undo a small decrement: PPO-PyTorch's schedule would then never move.
+        # Rounding can undo a small decrement: PPO-PyTorch's deviation would then never fall.
         if lower == stds[-1]:
             break
         stds.append(max(lower, config.std_floor))

@@ -137,7 +137,7 @@ class Checkpoints:
     def _write(self, leaves: Leaves, meta: dict[str, Any]) -> None:
         update = meta["update"]
         try:
-            if self._is_removed():  # writing would make the directory again
+            if self._is_removed():  # do not make the run directory again
                 raise FileNotFoundError
             if _is_sound(leaves) and update not in steps(self._run):
                 self._write_folder(leaves, meta | self._owner)

@@ -12,17 +12,17 @@ Row = Mapping[str, Any]
 
 
 def figures(rows: Sequence[Row], names: Sequence[str]) -> dict[str, str]:
-    """Formats what a call shows. `metrics.jsonl` has the rest.
+    """Formats the metrics that the display shows. `metrics.jsonl` has all metrics.
 
-    The episodes that end in an update are a biased sample, because short ones end first. All
-    episodes that began within one step limit measure how good the swarm is.
+    The texts cover a cohort: all episodes that began within one step limit. The episodes that end
+    in an update would be a biased sample, because short ones end first.
 
     Args:
       rows: rows of all seeds, as `recorder.rows` makes them, in order.
       names: names of the stages, in order.
 
     Returns:
-      Texts by name. Each is for the newest stage of each seed.
+      Texts by name, for the newest stage of each seed.
     """
     last = [row for row in rows if row["update"] == rows[-1]["update"]]
     newest = [names.index(row["stage"]) for row in last]
@@ -53,7 +53,7 @@ class Display:
     def __init__(self, *, quiet: bool = False) -> None:
         """Prepares a display; with `quiet` nothing is printed."""
         self._quiet = quiet
-        self._seconds = 2.0 if sys.stdout.isatty() else life.EVERY_S  # shortest between two lines
+        self._seconds = 2.0 if sys.stdout.isatty() else life.EVERY_S  # s between two lines
         self._last_line = -self._seconds
 
     def say(self, sentence: str, width: int = words.WIDTH) -> None:
@@ -63,7 +63,7 @@ class Display:
 
     @contextlib.contextmanager
     def busy(self, work: str) -> Iterator[None]:
-        """Says that work begins, and while the block runs now and then that it goes on."""
+        """Prints that work begins, and now and then, while the block runs, that it goes on."""
         self.say(f"{work} ...")
         silent = self._quiet or sys.stderr is None  # closed
         with contextlib.nullcontext() if silent else life.shown(lambda: f"still {work}"):
@@ -80,4 +80,4 @@ class Display:
         speed = f"{speeds['arena_steps_per_s']:,.0f} steps/s"
         parts += [f"{words.duration(seconds_left)} left", speed]
         line = words.lines("  ".join(part.replace(" ", words.GLUE) for part in parts))
-        self.say(line.partition("\n")[0])  # without what does not fit
+        self.say(line.partition("\n")[0])  # one line; the rest is left out

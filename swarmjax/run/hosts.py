@@ -33,7 +33,7 @@ _OWN = {"run.id": None}
 def join(settings: TrainConfig) -> None:
     """Joins the other processes of a run, if `run.distributed` is true.
 
-    JAX finds the other processes as `jax.distributed.initialize` says. JAX reads
+    `jax.distributed.initialize` documents how JAX finds the other processes. JAX reads
     `JAX_COORDINATOR_ADDRESS` itself, but not `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID`, which are
     needed without a cluster's scheduler.
 
@@ -181,7 +181,7 @@ def _check_alike(settings: TrainConfig) -> None:
         for key in own
         if own[key] != theirs.get(key)
     ]
-    other = "another process has other settings or versions"  # than this one, which is process 0
+    other = "another process has other settings or versions"  # this is process 0
     raise ConfigError(f"{differing[0] if differing else other}: give all processes the same.")
 
 

@@ -217,7 +217,7 @@ def _may_change(key: str) -> bool:
 
 
 def _kept_streams(streams: int | None, devices: Any, seeds_by: str) -> int | None:
-    """Returns a resumed run's number of streams: the stored one if its devices can share it."""
+    """Returns a resumed run's streams: the stored number if its devices can share them, or None."""
     by_seeds = seeds_by == "devices"
     fits = isinstance(devices, int) and streams and (by_seeds or streams % devices == 0)
     return streams if fits else None

@@ -1,6 +1,7 @@
 """Recipes: files that hold the settings of a whole run, for `recipe=NAME`.
 
-Recipes are made to be passed on, so they are data: `TrainConfig.shared` lists what they may set.
+Recipes are made to be passed on, so they hold no code. `TrainConfig.shared` lists the keys that
+they may set.
 """
 
 from collections.abc import Sequence

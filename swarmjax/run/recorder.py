@@ -117,7 +117,7 @@ class Recorder:
         self._open = contextlib.ExitStack()
         names = [METRICS, DECISIONS, *([EPISODES] if episodes else [])]
         self._logs = {name: self._open.enter_context(Log(run / name)) for name in names}
-        # A log that this process does not write still belongs to the run.
+        # Checkpoints also record the length of a log to which this process adds nothing.
         self._closed = {name: length for name, length in logs.items() if name not in names}
         self._loggers = [
             self._open.enter_context(contextlib.closing(Guarded(each))) for each in loggers

@@ -49,7 +49,8 @@ from swarmjax.training.loop import TrainState
 from swarmjax.training.rollout import Program
 
 CALL_SECONDS = 1.0  # target length of a call with run.chunk=auto: the display's interval
-# There is a checkpoint at least after this share of the budget, so that a short run has some too.
+# A checkpoint is due after this share of the budget at the latest, so that short runs have some
+# too.
 BUDGET_SHARE = 0.1
 GROWTH = 4  # a call is at most this many times as long as the previous one
 PATIENCE = 10  # a run has diverged after this many updates in a row without learning
@@ -91,8 +92,8 @@ class Run:
           display: shows the run; None: nothing is shown.
           loggers: receive the rows, beside the loggers that the config names.
           on_update: called with a copy of each row; it returns True to stop the run.
-          keep_traces: whether to keep traced programs for later runs. Only for a new process: its
-            code is that of the files, whose digest is the key.
+          keep_traces: whether to keep traced programs for later runs. Use it only in a new process:
+            a trace is found by the digest of the source files, which must be the code that runs.
         """
         self.settings = settings
         self._stop = stop or Stop()
@@ -103,7 +104,7 @@ class Run:
         self._kept: Kept | None = None
         self._first, self._seconds, self._earlier_s = 0, 0.0, 0.0
         self._newest: list[Row] = []  # the last row of each seed
-        self._barren: Counter[int] = Counter()  # newest updates in a row that taught nothing
+        self._barren: Counter[int] = Counter()  # how many updates in a row have now taught nothing
         self._saved = (0.0, 0)  # time and update of the newest checkpoint
 
     def train(self) -> None:
@@ -161,7 +162,7 @@ class Run:
             raise outputs.unwritable("run.dir", Path("runs") / name, error) from None
 
     def _broken(self, error: OSError | TrainingError) -> TrainingError:
-        """Says why the run ends, and what is left of it."""
+        """Says why the run ends, and where its checkpoints are."""
         why = str(error)
         if isinstance(error, OSError):
             why = f"{self.path} cannot be written: {error.strerror or error}."
@@ -240,7 +241,7 @@ class Run:
         return self.update == self.settings.updates or self._has_reached()
 
     def _has_reached(self) -> bool:
-        """Returns whether `run.stop_at` ends the run here, which only the end of a cohort can."""
+        """Returns whether `run.stop_at` ends the run here, at the end of a cohort."""
         if self.settings.run.stop_at is None or self.update % int(self.schedule.cohort_updates):
             return False
         return bool(hosts.share(results.has_reached(self.settings, self._newest))[0])
@@ -305,7 +306,7 @@ class Run:
             elif self._seconds:
                 n = int(np.clip(CALL_SECONDS / self._pace, 1, GROWTH * n))
             most = min(goal - self.update, self.program.rows)
-            if settings.run.stop_at is not None:  # calls of any length then stop at the same update
+            if settings.run.stop_at is not None:  # calls must end where a cohort ends
                 cohort = int(self.schedule.cohort_updates)
                 most = min(most, cohort - self.update % cohort)
             yield int(hosts.share(min(n, most))[0])

@@ -17,7 +17,7 @@ from swarmjax.training.rollout import Program
 def first(
     settings: TrainConfig, run: Path, kept: Kept | None, source: Kept | None
 ) -> Iterator[str]:
-    """Describes what is trained on what and into which folder, and what the run starts from."""
+    """Describes the stages, updates, seeds, device and folder of a run, and what it starts from."""
     names, title, seeds = settings.stage_names, settings.stage_name, settings.numbers
     stages = words.shorten(title, 40) + (f" {names[0]} to {names[-1]}" if len(names) > 1 else "")
     several = f" of seeds {seeds[0]} to {seeds[-1]}" if settings.seeds > 1 else ""

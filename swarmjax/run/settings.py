@@ -13,7 +13,7 @@ from swarmjax.training.config import ProgramConfig
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Section):
-    """Where a run is written, and how often."""
+    """Where a run is written, how often, and when it stops."""
 
     id: str | None = setting(None, "random id, drawn when the run begins", derived=True)
     dir: str | None = setting(None, "run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
@@ -49,8 +49,8 @@ class TrainConfig(ProgramConfig):
     """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
-    # What is trained. Which code runs, where it is written, what it starts from and who is called
-    # is decided by whoever starts the run.
+    # These keys say what is trained. Keys that name code, paths or loggers must come from the user
+    # who starts the run.
     shared: ClassVar[tuple[str, ...]] = (
         *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
         *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),

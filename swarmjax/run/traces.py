@@ -56,7 +56,7 @@ def keep(
         return jitted
     shapes = [(each.shape, each.dtype) for each in jax.tree.leaves(given)]
     fast = dispatch.load_fast("arenas_warp", program.world.physics.engine.impl)
-    before = [] if fast is None else list(fast.CALLS)  # the next trace counts on from these
+    before = [] if fast is None else list(fast.CALLS)  # numbers of new calls follow these
     # Pickled call by call, because `pickle` writes what calls share only once, and a call that was
     # repeated shares other things than a call that was traced.
     calls = [pickle.dumps(solve) + repr(given).encode() for solve, given in before]
@@ -77,10 +77,10 @@ def keep(
 
 
 def _can_keep(program: Program[TrainConfig]) -> bool:
-    """Returns whether the key covers the whole trace, and the trace is all that a call needs."""
+    """Returns whether the key covers all of the trace, and a call needs only the trace."""
     config, engine = program.config, program.world.physics.engine
-    # Tracing also registers the kernels of Warp, of which only those for planar robots can be
-    # registered again. An extension may import any file, which the key would not cover.
+    # Tracing also registers Warp's kernels. Only those for planar robots can be registered again.
+    # An extension may import any file, and the key does not cover these files.
     again = engine.impl == "jax" or (engine.solver, config.robot.body) == ("swarm", "planar")
     return again and config.devices == 1 and config.extensions is None
 

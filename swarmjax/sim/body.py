@@ -14,7 +14,7 @@ import numpy as np
 from swarmjax.sim.config import RobotConfig
 
 Array = Any
-Changes = dict[str, tuple[Any, Array]]  # for each changed field of the model: rows, new values
+Changes = dict[str, tuple[Any, Array]]  # by model field: changed rows, new values
 
 
 class Chassis(NamedTuple):

@@ -13,13 +13,13 @@ from jax import Array
 
 # Warp stores the pairs of geoms that may touch, for all arenas together. It compares spheres around
 # geoms, and the sphere around a wall contains all robots. So for each robot, Warp gets memory for
-# pairs with all walls and boxes, and with this number of other robots on average. A robot of a
-# swarm is near far fewer others on average.
+# pairs with all walls and boxes, and with this number of other robots on average. On average, a
+# robot of a swarm has far fewer others near it.
 OTHERS_PER_ROBOT = 3
 # Largest number of contacts per robot in one arena. A disc touches at most six discs of its own
 # size at once.
 ROWS_PER_ROBOT = 6
-_STARTING = threading.Lock()  # `train` starts Warp in a thread; two starts would create Warp twice
+_STARTING = threading.Lock()  # `train` also starts Warp in a thread, and it must start only once
 FEW_ARENAS = 64  # up to this number of arenas, every pair of geoms gets memory: all may be crowded
 
 # Model and data of MJX (in either implementation), or of a faster engine that uses the same field
@@ -103,7 +103,7 @@ def start_warp() -> None:
 
 
 def _limits(model: mujoco.MjModel, robots: int, arenas: int) -> dict[str, int]:
-    """Returns how many contacts of all arenas and solver rows of each arena Warp has memory for."""
+    """Returns the contacts (of all arenas) and solver rows (of one arena) that Warp stores."""
     on_floor = model.geom_type[model.pair_geom1] == mujoco.mjtGeom.mjGEOM_PLANE
     rows = _rows(model)
     of_world = (model.geom_bodyid[[model.pair_geom1, model.pair_geom2]] == 0).any(axis=0)

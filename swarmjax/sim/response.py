@@ -30,7 +30,7 @@ class Table(NamedTuple):
       length: increasing ray lengths along the tilted ray, m.
       counts: counts at each length, decreasing.
       share: standard deviation of the noise at each length, relative to the counts.
-      rise: ratio of a ray's horizontal length to its length, the cosine of the tilt.
+      rise: cosine of a ray's tilt: its horizontal length divided by its length.
     """
 
     length: tuple[float, ...]
@@ -45,7 +45,7 @@ class Table(NamedTuple):
 
 
 def table(points: Sequence[Sequence[float]], tilt: float) -> Table:
-    """Makes a table from rows of `robot.sensor_response`, for rays that rise by `tilt` rad."""
+    """Makes a table from rows of `robot.sensor_response`, for rays tilted upwards by `tilt` rad."""
     length, counts, share = zip(*points, strict=True)
     return Table(length, counts, share, math.cos(tilt))
 

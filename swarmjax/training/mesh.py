@@ -175,5 +175,5 @@ def _placed(sharding: NamedSharding, x: jax.Array) -> jax.Array:
 
 
 def _without_empty(state: TrainState) -> TrainState:
-    """Makes arrays without elements anew, because `shard_map` of jaxlib 0.11.2 fails on them."""
+    """Replaces empty arrays by new ones, because `shard_map` of jaxlib 0.11.2 fails on them."""
     return jax.tree.map(lambda x: x if x.size else jnp.zeros(x.shape, x.dtype), state)

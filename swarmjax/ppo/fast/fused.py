@@ -59,7 +59,7 @@ METRICS = (
     "skipped_steps",
 )
 
-# What the kernel of each network reads of a sample.
+# The parts of a sample that the kernel of each network reads.
 _READ = {
     "actor": ("observation", "action", "log_prob", "advantage", "valid"),
     "critic": ("observation", "return_", "valid"),

@@ -11,8 +11,8 @@ arena has one thread.
 
 Comparing all pairs of many robots would take too long. With more than `MANY` robots, a first kernel
 therefore lists the contacts: one thread for each obstacle, wall and robot looks for robots in the
-cells around it (`cells_warp`). The list has the same order. The threads of the arena then only
-solve for the forces.
+cells around it (`cells_warp`). The order of the list stays the same. The threads of the arena then
+only solve for the forces.
 
 JAX calls the kernel through `warp.jax_kernel`, so XLA can include it in a CUDA graph.
 """
@@ -190,7 +190,7 @@ def let_go(arena: WarpArena, first: int) -> None:
 
 @wp.func
 def _deal_out(arena: WarpArena, count: int, thread: int) -> int:
-    """Distributes the islands among the threads; returns this thread's first contact, or -1.
+    """Assigns the islands to the threads; returns this thread's first contact, -1 if it has none.
 
     Also sets all accelerations to their values without contacts.
     """

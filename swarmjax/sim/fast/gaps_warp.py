@@ -56,7 +56,7 @@ def list_by_cells(
     def run(start: Array, shape: tuple[int, int, int]) -> tuple[Array, Array]:
         return call(*given, start, launch_dims=owners, output_dims={"contact": shape})
 
-    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # no room to list any
+    count = run(jnp.ones(owners, jnp.int32), (2, 1, arenas))[0]  # counts only; stores no contact
     end = jnp.cumsum(count, axis=1)
     return end[:, -1], run(end - count, shape)[1]
 
