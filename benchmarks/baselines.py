@@ -1,7 +1,7 @@
 """Writes a policy without learning, to which trained policies are compared.
 
 `python -m benchmarks.baselines out=FILE.npz` writes a policy that `swarmjax.evaluate
-policy=FILE.npz` judges like any other. It drives straight to the target and ignores the infrared
+policy=FILE.npz` evaluates like any other. It drives straight to the target and ignores the infrared
 sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
 """
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks import faults_inputs, faults_policies
 
-MOST_SECONDS = 5.0  # of processor time, until a file is refused
+MOST_SECONDS = 5.0  # s of processor time until a file is refused
 _EVERY = 50  # one of this many trials runs a whole command
 _SECRET = "SWARMJAX_SECRET"
 _EVIL = "evil.py"
@@ -99,7 +99,7 @@ class _Watch:
             self.note("IMPORT", values[0].co_filename)
 
     def written(self, path: Path) -> None:
-        """Notes a path that is written, unless it may be."""
+        """Records a path that was written, unless it may be written."""
         assert self.folder is not None
         allowed = (self.folder / _OUT, self.folder / _TMP, Path("/dev"))
         # A file without a name opens its folder.
@@ -107,7 +107,7 @@ class _Watch:
             self.note("WRITE", path)
 
     def note(self, what: str, detail: object) -> None:
-        """Notes something that must not happen."""
+        """Records something that the trial must not do."""
         self.seen.append(f"{_SEEN}{what} {detail}")
         if __name__ == "__main__":  # the parent reads it
             os.write(2, f"\n{_SEEN}{what} {detail}\n".encode())

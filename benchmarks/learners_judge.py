@@ -1,4 +1,4 @@
-"""Judges learners in training on the levels of `swarmjax.evaluate`, on the training device."""
+"""Evaluates learners during training, on its device and on the levels of `swarmjax.evaluate`."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -101,7 +101,7 @@ def outcomes(
     *,
     sampled: bool = False,
 ) -> Outcomes:
-    """Runs an episode of each level with policies in training.
+    """Runs an episode of each level with policies that are still in training.
 
     The function is pure: `jit` it with `world`, `ppo` and `steps` bound, and `vmap` it over the
     seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
@@ -114,7 +114,8 @@ def outcomes(
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
-      sampled: whether to draw the actions from the policies; otherwise they are their means.
+      sampled: whether to draw the actions from the policies; otherwise each action is the policy's
+        mean.
 
     Returns:
       [E] outcomes. If the physics of an episode breaks, the episode ends at that step, and its

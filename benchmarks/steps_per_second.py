@@ -145,7 +145,7 @@ def environment(
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    began = replace(arenas, sim=unpack(arenas.sim), recall=NO_MEMORY)  # random actions need none
+    began = replace(arenas, sim=unpack(arenas.sim), recall=NO_MEMORY)  # random: no memory
     keys = jax.random.split(key, _rollouts(program.config))
     ended, sums = jax.lax.scan(rolled, began, keys)
     packed = jax.vmap(physics.pack)(ended.sim)

@@ -1,4 +1,4 @@
-"""Shows that long work goes on: a line now and then, also where the output is no terminal."""
+"""Shows that long work goes on, by a line now and then, even if the output is no terminal."""
 
 import contextlib
 import os
@@ -11,7 +11,7 @@ from typing import Any
 
 from swarmjax import words
 
-EVERY_S = 10.0  # time between two lines
+EVERY_S = 10.0  # s between two lines
 
 # Filters XLA's advice to file a bug about a program that compiles for two minutes. The advice is an
 # error of XLA's log, and no setting of XLA hides it without all other errors.
@@ -23,7 +23,7 @@ for line in sys.stdin.buffer:
 
 @contextlib.contextmanager
 def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> Iterator[None]:
-    """Says a text and for how long the block has run, every `EVERY_S`, and hides XLA's advice.
+    """Prints a text and the block's running time every `EVERY_S`, and hides XLA's advice.
 
     Another process filters standard error, so that the last words of a process that crashes are
     printed too. It has a session of its own, so that Ctrl-C does not end it.
@@ -46,13 +46,14 @@ def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> 
             os.dup2(stderr, 2)
             os.close(stderr)
             ended.set()
-            # Another thread waits, since a child that has begun here may hold the pipe open.
+            # Wait in a thread, since a child process that the block has started may hold the pipe
+            # open.
             threading.Thread(target=pipe.wait, daemon=True).start()
 
 
 @contextlib.contextmanager
 def progress(command: str) -> Iterator[Any]:
-    """Shows on standard error how far a command is: a bar on a terminal, elsewhere lines.
+    """Shows a command's progress on standard error: as a bar on a terminal, otherwise as lines.
 
     Args:
       command: name of the command.
@@ -60,7 +61,7 @@ def progress(command: str) -> Iterator[Any]:
     Yields:
       Rich's progress, to which tasks are added.
     """
-    from rich.console import Console  # a run, which shows no bar, does not wait for it
+    from rich.console import Console  # imported only if needed
     from rich.progress import Progress
 
     console = Console(stderr=True)

@@ -73,14 +73,15 @@ class Counts(NamedTuple):
         return interval(self.episodes * getattr(self, what) / of, self.episodes)
 
     def expected(self, what: str, budget: int) -> Interval[float]:
-        """Returns how many of the episodes in a budget of control steps are such by chance."""
+        """Returns how many episodes of a kind chance gives in a budget of control steps."""
         return Interval(*(p * budget * self.episodes / self.steps for p in self.share(what)))
 
     def deciding(self, what: str, budget: int) -> float:
-        """Returns how many episodes would show whether the budget has at least one such episode.
+        """Returns how many episodes to count to tell whether a budget holds one of a kind.
 
-        It takes the chance that was counted as the true one. Its interval excludes one episode in
-        the budget by then: an exact interval if there was none, else a normal one.
+        The counted chance is taken as the true chance. After that many episodes, its interval
+        excludes a chance of one episode in the budget. The interval is exact if no such episode was
+        counted, and otherwise normal.
         """
         chance, one = self.share(what).estimate, self.steps / (budget * self.episodes)
         if not chance:
@@ -88,10 +89,10 @@ class Counts(NamedTuple):
         return _DEVIATIONS**2 * chance / (chance - one) ** 2 if chance != one else math.inf
 
     def product(self, budget: int) -> float:
-        """Returns the most episodes in a budget to expect with all robots at their targets at once.
+        """Returns at most how many episodes of a budget end with all robots at their targets.
 
-        All of them are visitors then, so the chance is at most that of one visitor to the power of
-        the number of robots, if each robot comes to its target independently of the others.
+        All robots are then visitors. If they come to their targets independently of each other, the
+        chance is at most the chance of one visitor to the power of the number of robots.
         """
         chance = self.share("visitors").high ** (self.robots / self.episodes)
         return chance * budget * self.episodes / self.steps
@@ -101,8 +102,9 @@ def interval(successes: float, trials: int) -> Interval[float]:
     """Computes a chance with its exact interval (Clopper & Pearson 1934).
 
     Args:
-      successes: number of successes. A sum of shares between 0 and 1 is taken too. Its interval is
-        too wide rather than too narrow, since shares vary less than successes of the same mean.
+      successes: number of successes. It may also be a sum of shares between 0 and 1. The interval
+        is then too wide rather than too narrow, since shares vary less than successes of the same
+        mean.
       trials: number of trials.
     """
     failures = trials - successes
@@ -199,14 +201,14 @@ def count(ended: Ended) -> Counts:
 
 
 def paid(task: TaskConfig) -> str:
-    """Returns the episodes in which a reward for arriving is paid: with `any` visitor, or `all`."""
-    in_time = task.reward.step_penalty != 0  # paid for each step, also with `hold`
+    """Returns which episodes pay for arriving: those with `any` robot at its target, or `all`."""
+    in_time = task.reward.step_penalty != 0  # paid even with `hold`
     together = task.arrival == "hold" or task.goal == "gather"
     return "all" if together and not in_time else "any"
 
 
 def _holds(task: TaskConfig) -> bool:
-    """Returns whether only robots that are within their targets at once are paid."""
+    """Returns whether robots are paid only if all are within their targets at the same time."""
     return task.arrival == "hold" and paid(task) == "all"
 
 

@@ -10,7 +10,7 @@ from swarmjax.extension import OwnCurriculum
 
 PROMOTING = ("sequential", "mixed")  # modes that move from stage to stage
 MODES = (*PROMOTING, "adaptive", "frontier")
-# By option: the key `mode`, and the modes that read the option.
+# Some options are read only in certain modes: by option, the key `mode` and these modes.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     **dict.fromkeys(("budget_share", "optimizer", "exploration"), ("mode", PROMOTING)),
     **dict.fromkeys(("score", "shares"), ("mode", ("adaptive",))),
@@ -23,7 +23,8 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 class CurriculumConfig(Section):
     """Settings: which arenas train on which stage, when that changes, and what a promotion changes.
 
-    Some options are read only by some modes. Their texts end with these modes, in brackets.
+    Some options are read only in certain modes. Their descriptions end with these modes, in
+    brackets.
     """
 
     mode: str = setting(

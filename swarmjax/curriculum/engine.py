@@ -29,7 +29,7 @@ from swarmjax.task.stage import Stage
 
 STAYED, BY_THRESHOLD, BY_BUDGET, REWEIGHED = range(4)
 REASONS = ("stayed", "threshold", "budget", "reweighed")
-NEVER = np.iinfo(np.int32).max  # deadline of a stage that has none
+NEVER = np.iinfo(np.int32).max  # stands for no deadline
 # Cohort number of an episode that does not count. Cohorts have numbers from 0, and -1 is the cohort
 # before the first.
 UNCOUNTED = -2
@@ -203,7 +203,7 @@ class CurriculumState:
     Attributes:
       own: the curriculum's own state, as `Curriculum.init` makes it.
       cohorts: the two newest cohorts, and the record of all stages.
-      met: [] most robots of any stage that was trained so far, int32.
+      met: [] largest number of robots of the stages trained so far, int32.
     """
 
     own: Any

@@ -134,7 +134,7 @@ def _columns(
     latched = (recording.arrival > 0) & (np.arange(rows)[:, None] >= recording.arrival)
     if (recording.target != recording.target[0]).any():
         series["target"] = recording.target / length
-    if (recording.arrived != latched).any():  # a robot left again, which `arrival` cannot show
+    if (recording.arrived != latched).any():  # some robot left its target; `arrival` cannot show it
         series["arrived"] = recording.arrived.astype(int)
     if recording.measured.size:
         series["measured"] = recording.measured / MEASURE

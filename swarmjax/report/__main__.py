@@ -3,8 +3,8 @@
 For one run it writes its figures, and `report.html`, which holds all of them. The run may still be
 going or may have been killed: the report leaves out a line that is not fully written. No JAX.
 
-For several runs it prints a table and draws their success over each other: see `table` and
-`comparison`.
+For several runs it prints a table and draws the success of all runs into one figure: see `table`
+and `comparison`.
 
 Examples:
   # into runs/first/report

@@ -99,7 +99,7 @@ def _last_stage(history: History) -> str:
     values = history.success[:, -1, -1]
     (mean,), (measured,) = report_rows.among(values[:, None])
     if not measured:
-        return "not measured: no full group of episodes has ended on it"
+        return "not measured: too little training on this stage so far"
     text = f"{history.names[-1]}: {report_rows.measure(history)} {_percent(mean)}"
     if len(history.seeds) == 1:
         return text

@@ -25,7 +25,7 @@ from swarmjax.task.goals.goal import MEASURED
 
 Row = dict[str, Any]
 
-# Keys of lists with one number per stage, from the newest full group of episodes on that stage.
+# Keys of lists with one number per stage, each from the stage's newest finished cohort.
 BY_STAGE = ("success_by_stage", "complete_by_stage", "contacts_by_stage", "return_by_stage")
 _LISTS = ("mix", *BY_STAGE)
 # Keys with one number per update. The first two cover the episodes that ended in the update.

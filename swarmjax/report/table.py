@@ -36,10 +36,11 @@ class TableLine(NamedTuple):
       runs: their directories.
       settings: the settings that differ from the other lines, as `key=value` words.
       stage: name of the last stage.
-      updates: updates that all of the runs have done.
-      budget: updates that they are to do.
+      updates: number of updates that each run has done at least.
+      budget: number of updates that each run is to do.
       seeds: increasing.
-      success: of each seed on the last stage in its newest cohort, 0 to 1; None if there is none.
+      success: success of each seed on the last stage, in the newest cohort, 0 to 1; None without
+        one.
       measure: names the quantity in `success`.
       mean: mean success over the seeds that have one; None where no seed has one.
       interval: ends of the mean's 95 % interval over seeds; None for fewer than three seeds.
@@ -111,7 +112,7 @@ def read(runs: Sequence[Path]) -> list[Group]:
     for run in runs:
         history = rows.read(run)
         shared = {k: v for k, v in to_dict(history.config).items() if k not in _APART}
-        shared["run"] = {"stop_at": history.config.run.stop_at}  # a run that stops early differs
+        shared["run"] = {"stop_at": history.config.run.stop_at}  # part of what is compared
         shared["stage"] = {stage["name"]: stage for stage in shared["stage"]}
         groups.setdefault(json.dumps(shared), []).append((run, history))
     flat = [files.flatten(json.loads(key)) for key in groups]
@@ -170,7 +171,7 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
 
 
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
-    """Writes the settings that differ between lines, without settings that follow from others.
+    """Writes the settings that differ between lines, except those that follow from other settings.
 
     Stages of one name are compared setting by setting. An own piece is written without its digest.
     """

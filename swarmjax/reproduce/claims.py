@@ -23,7 +23,7 @@ from swarmjax.reproduce.criteria import Criterion, about, crowded, earlier, high
 from swarmjax.reproduce.measures import NUMBER, SHARE, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, PAIR, TUNED, Reproduction
 
-# Share of targets reached that counts as the desired behaviour; also promotes from a stage.
+# Share of targets reached from which behaviour counts as desired; also the curriculum's threshold.
 GENERATED = 0.8
 FAILED = 0.5  # a swarm fails if it reaches a smaller share of its targets
 HELD = {True: "holds", False: "contradicted", None: "open"}

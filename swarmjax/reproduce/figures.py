@@ -22,7 +22,7 @@ from swarmjax.reproduce import measures
 from swarmjax.reproduce.measures import AXES, WINDOW, Axis, Measure
 from swarmjax.reproduce.rows import EXPANDED, LAST, MODERN, PAIR, TUNED, Reproduction, RunLog
 
-_POINTS, _RESAMPLES = 100, 1000  # of the interval along a curve: its points, bootstrap resamples
+_POINTS, _RESAMPLES = 100, 1000  # of a curve's interval: points, bootstrap resamples
 COLOURS = {"curriculum": "#0072b2", "baseline": "#d55e00"}
 COLOURS |= {f"{arm}_expanded": colour for arm, colour in COLOURS.items()}
 COLOURS |= {"modern_curriculum": "#009e73", "modern_baseline": "#aa4499"}

@@ -61,7 +61,7 @@ class LivePage:
             return report_page.page(history=self.history, figures=self.figures, **about)
 
     def _draw(self) -> None:
-        """Draws the figures if the run has logged more, unless drawing must rest."""
+        """Draws the figures if the run has logged more, but not too soon after the last drawing."""
         metrics, began = self.run / METRICS, time.monotonic()
         written = metrics.stat().st_size if metrics.exists() else 0
         if written in (0, self._drawn) or began < self._rests_until:

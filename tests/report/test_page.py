@@ -83,7 +83,7 @@ def test_the_summary_says_that_a_run_stopped_at_its_success(tmp_path: Path) -> N
 def test_a_run_that_measured_nothing_has_a_page(tmp_path: Path) -> None:
     history = replace(_history(tmp_path, [row(0)]), seconds=None)
     page = _page(history)
-    unmeasured = "not measured: no full group of episodes has ended on it"
+    unmeasured = "not measured: too little training on this stage so far"
     assert page.fact("last stage") == unmeasured
     assert page.fact("Promotions") == "None. The shares of the stages changed 0 times."
     assert "min" not in page.fact("trained")
