@@ -60,7 +60,7 @@ class Prepared:
 
     Attributes:
       program: the parts of training that are fixed at compile time.
-      schedule: the curriculum's numbers, an argument of the compiled programs.
+      schedule: the curriculum's stages, deadlines and thresholds, an argument of all programs.
       start: makes the first state from the schedule.
       keys: [N] a random key for each seed.
       physics: program that steps the physics alone.

@@ -66,7 +66,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """Input of the policy, [A, R, O]. If an arena's episode has ended, the next one's input."""
+        """Input of the policy, [A, R, O]. Where an episode has just ended, that of the next."""
         return self.arenas.observation
 
     @property

@@ -46,7 +46,7 @@ Success = Literal["targets", "all"]
 
 
 class Schedule(NamedTuple):
-    """The curriculum's numbers: an argument of the compiled program, not constants in it.
+    """The curriculum's stages, deadlines and thresholds: an argument of the compiled program.
 
     Attributes:
       stages: [S], in order.
@@ -221,7 +221,7 @@ def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
 
     Args:
       curriculum: the curriculum.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
 
     Returns:
       The state before the first update.
@@ -245,7 +245,7 @@ def observe(
 
     Args:
       curriculum: the curriculum.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       success: the measure of success by which the curriculum decides.
       state: the state before these episodes are counted.
       ended: [T, A] episodes that ended, of this device.

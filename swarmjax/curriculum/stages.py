@@ -64,7 +64,7 @@ def make(
     """Makes the curriculum that the settings select.
 
     Args:
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       options: settings of the curriculum.
       own: curricula of an extension.
     """
@@ -142,7 +142,7 @@ def promoting(
 
     Args:
       state: state of the mode.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       options: settings of the curriculum.
       verdict: what the cohorts show after the update.
       update: [] number of the finished update, from 0; -1 before the first.
@@ -199,7 +199,7 @@ def adaptive(
     floor = jnp.asarray(schedule.floor)
     weights = floor / stages + (1.0 - floor) * share
     if options.shares == "robots":
-        # Shares of arenas with which each stage's share of the robots is its weight.
+        # These shares of the arenas make each stage's share of the robots equal to its weight.
         arenas = weights / jnp.asarray(schedule.stages.robots).astype(jnp.float32)
         weights = arenas / jnp.sum(arenas)
     judged = verdict.over & jnp.any(verdict.judged)

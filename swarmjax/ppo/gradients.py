@@ -252,7 +252,7 @@ def mean_of_taken(metrics: Metrics) -> Metrics:
       but some were skipped, the means are -inf. If no step was taken or skipped, they are 0.
     """
     taken, skipped = jnp.sum(metrics["taken_steps"]), jnp.sum(metrics["skipped_steps"])
-    # Exactly 1 if all steps of the update were taken.
+    # The result is exactly 1 if all steps of the update were taken.
     share = metrics["taken_steps"].size / jnp.maximum(taken, 1.0)
     # Lost means are -inf and not NaN, because JAX_DEBUG_NANS would stop at a NaN.
     lost = (taken == 0) & (skipped > 0)

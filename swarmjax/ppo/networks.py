@@ -129,14 +129,15 @@ class Normalizer:
         share = batch_count / jnp.maximum(count, 1.0)
         shift = batch_mean - self.mean
         spread = batch_variance + (1.0 - share) * shift**2
-        # The first batch replaces the variance of 1, from which a small one would lose digits.
+        # The first batch replaces the initial variance of 1. A step from 1 to a small variance
+        # would lose digits.
         before = jnp.where(share == 1.0, spread, self.variance)
         mean, mean_rest = _add(self.mean, share * shift + self.rest[0])
         variance, variance_rest = _add(before, share * (spread - before) + self.rest[1])
         return Normalizer(
             count=count,
             mean=mean,
-            variance=jnp.maximum(variance, 0.0),  # rounding may leave less
+            variance=jnp.maximum(variance, 0.0),  # rounding may give less
             rest=jnp.stack([mean_rest, variance_rest]),
         )
 

@@ -14,7 +14,7 @@ from swarmjax.evaluate.cells import Suite
 from swarmjax.evaluate.trials import Entrant, Trial
 from swarmjax.replay.config import ReplayConfig
 
-RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # these order episodes
+RANKED = ("targets_reached", "contacts_per_robot", "episode_time_s")  # they rank episodes
 
 
 def find(settings: ReplayConfig, entrant: Entrant, suite: Suite) -> tuple[str, list[Trial]] | None:

@@ -144,7 +144,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
 
 
 def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
-    """Takes a frame of all arenas: the fields of `Frames` without the axis N."""
+    """Records one frame of all arenas: the fields of `Frames` without the axis N."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
     )

@@ -100,4 +100,4 @@ def _label(line: TableLine) -> str:
     place, seeds = table.cells(line)[-1], words.count(len(line.seeds), "seed")
     settings = textwrap.shorten(line.settings, _LONGEST, placeholder=" ...")
     label = f"{settings} ({seeds}, {words.shorten(place, _LONGEST)})".lstrip()
-    return label.replace("$", r"\$")  # else two of them would begin a formula
+    return label.replace("$", r"\$")  # Matplotlib sets text between two $ as a formula

@@ -63,7 +63,7 @@ class Run:
       settings: its config.
       path: its directory, once it is open.
       program: the parts that fix the compiled program, once it is loaded.
-      schedule: the curriculum's numbers, an argument of the program.
+      schedule: the curriculum's stages, deadlines and thresholds, an argument of the program.
       state: [N] the training state.
       compiled: the program to call, once it is compiled.
       update: updates that every seed has done.

@@ -128,7 +128,7 @@ class RobotConfig(Section):
 
     @property
     def wheel_inertia(self) -> list[float]:
-        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the wheel's mass.
+        """Moments of inertia of a wheel, kg m^2: those of the e-puck's wheel, scaled by the mass.
 
         The values do not depend on the radius. About the axle, the motor's inertia is far larger
         than the wheel's. About the upright axis, the body makes up the rest of `yaw_inertia`.

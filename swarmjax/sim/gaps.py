@@ -54,7 +54,7 @@ def gaps(
 
 
 def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
-    """Returns signed distances [...] from points to turned rectangles, m."""
+    """Returns signed distances [...] from points to rotated rectangles, m."""
     x, y = to_box_frame(x - box.x, y - box.y, box)
     x, y = xp.abs(x) - box.half_x, xp.abs(y) - box.half_y
     outside = xp.sqrt(xp.maximum(x, 0.0) ** 2 + xp.maximum(y, 0.0) ** 2)

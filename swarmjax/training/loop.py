@@ -52,7 +52,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       seed: [] seed of the run, int32; None for the seed of the config.
 
     Returns:
@@ -74,7 +74,7 @@ def train_chunk(
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       state: state before these updates.
       n: [] number of updates, at most `program.rows`, int32.
 
@@ -99,7 +99,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       state: state before this update.
 
     Returns:

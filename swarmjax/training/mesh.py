@@ -82,7 +82,7 @@ def init(program: Program) -> Callable[..., TrainState]:
       program: the compiled program.
 
     Returns:
-      A function from the curriculum's numbers and the seeds [N] to the states [N] before the first
+      A function from the curriculum's schedule and the seeds [N] to the states [N] before the first
       update, spread over devices. Called without seeds, it takes the seeds of the config.
     """
     start = partial(seeds.each, partial(loop.init, program))

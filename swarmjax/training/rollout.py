@@ -38,7 +38,7 @@ class Program[C: ProgramConfig]:
       config: settings of the program.
       world: the compiled environment.
       ppo: how the learners act and learn.
-      curriculum: makes the curriculum with the numbers of a schedule.
+      curriculum: makes the curriculum for a `Schedule`.
       shards: how the arenas are spread over devices.
       by_robot: whether to report each episode robot by robot.
       waiting: episodes that are drawn for each arena before a rollout.

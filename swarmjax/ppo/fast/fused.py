@@ -90,7 +90,7 @@ def choose_launch(
       config: Settings of networks that `fits` accepts.
       observation_size: O.
       action_size: U.
-      samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
+      samples: B, the samples of a batch that is split into minibatches; None if it is not split.
 
     Returns:
       `LARGE` if the chip has enough memory for it and each minibatch gets at least `_LEAST_TILES`
@@ -214,7 +214,7 @@ def flat_gradient(
     actor, surrogate = run("actor", surrogate_loss)
     critic, error = run("critic", _half_square)
     count = error.pop("valid")
-    weight = count * share  # weight in the mean of a term that all samples share
+    weight = count * share  # factor on a term that is equal for all samples
     first, width = layout["actor"].vectors["log_std"]
     deviation = jnp.exp(flat["actor"][first : first + width])
     metrics = {name: total * share for name, total in (surrogate | error).items()}

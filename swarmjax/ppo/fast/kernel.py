@@ -187,7 +187,8 @@ def sums(
         functools.partial(_program, of_tile, shapes, layout, launch.tile),
         grid=(programs,),
         out_shape=jax.ShapeDtypeStruct((programs * width,), jnp.float32),
-        # Prefetching does not pay: a tile's samples are few bytes compared with its products.
+        # Prefetching does not pay: loading a tile's samples takes little time compared with its
+        # products.
         compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
     )(parameters, samples, tiles)
     total = jnp.sum(totals.reshape(programs, width), axis=0)

@@ -257,7 +257,7 @@ def _to_disc(ray: wp.vec4, centre: wp.vec3, radius: float) -> float:
 
 @wp.func
 def _to_box(ray: wp.vec4, box: WarpBox) -> float:
-    """Returns the distance to a turned rectangle, as in `infrared.ray_box`."""
+    """Returns the distance to a rotated rectangle, as in `infrared.ray_box`."""
     away_x, away_y = ray[0] - box.x, ray[1] - box.y
     x, y = box.cos * away_x + box.sin * away_y, box.cos * away_y - box.sin * away_x
     across_x = _cross(x, box.cos * ray[2] + box.sin * ray[3], box.half_x)

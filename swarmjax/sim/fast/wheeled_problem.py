@@ -53,8 +53,8 @@ class Problem:
       J_column: [A, 1, E] joint to which an entry belongs.
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
-      first: [A, N] the argument `side` of `entries_of` for a row's robot, or for the robot with the
-        higher index of two.
+      first: [A, N] the argument `side` of `entries_of` for a row's robot. If a row has two robots,
+        this is for the robot with the higher index.
       second: [A, N] the argument `side` for the other robot; -1 for none.
       own: [A, R] number of rows that involve a robot.
       row: [A, R, K] the indices of these rows, and where the robot's entries are in them: the
