@@ -262,8 +262,8 @@ def conclusion(settings: ProbeConfig, counts: Sequence[Counts]) -> str:
         )
     enough = _number(last.deciding(signal, settings.budget))
     return (
-        f"{says} {low} to {high} such episodes in the budget, which leaves {name} alone undecided: "
-        f"about {enough} episodes would decide (episodes), or {use}"
+        f"{says} {low} to {high} such episodes in the budget. It is unclear if training on {name} "
+        f"alone can begin: give episodes of about {enough}, or {use}"
     )
 
 

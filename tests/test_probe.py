@@ -182,9 +182,9 @@ def _counts(**given: int) -> Counts:
          "Nothing is paid until a robot arrives. Chance gives about 750 such episodes in the "
          "budget (560 to 970): training on s6 alone can begin."),
         (["task.reward.progress=0"], {},
-         "Nothing is paid until a robot arrives. Chance gives 0 to 55 such episodes in the budget, "
-         "which leaves s6 alone undecided: about 28,000 episodes would decide (episodes), or use a "
-         "curriculum (docs/curriculum.md)."),
+         "Nothing is paid until a robot arrives. Chance gives 0 to 55 such episodes in the "
+         "budget. It is unclear if training on s6 alone can begin: give episodes of about "
+         "28,000, or use a curriculum (docs/curriculum.md)."),
         (["task.reward.progress=0", "budget=1e4"], {},
          "Nothing is paid until a robot arrives. Chance gives fewer than 0.18 such episodes in the "
          "budget: use a curriculum (docs/curriculum.md)."),

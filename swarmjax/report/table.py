@@ -219,7 +219,7 @@ def text(lines: Sequence[TableLine]) -> str:
             written.append("  ".join(map(str.ljust, parts, widths)).rstrip())
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
-        f"Success: {measures} on the last stage, over its newest episodes begun together; mean "
-        f"over seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds or more."
+        f"Success: {measures} on the last stage, in the newest episodes that began within one step "
+        f"limit; mean over seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds."
     )
     return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])

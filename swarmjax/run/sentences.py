@@ -96,7 +96,7 @@ def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     episodes = min(row["episodes_by_stage"][-1] for row in measured)
     return (
         f"{said} within {steps} control steps ({seconds:.3g} s), over "
-        f"{words.count(episodes, 'episode')} begun together"
+        f"{words.count(episodes, 'episode')}"
     )
 
 
