@@ -1,4 +1,4 @@
-"""Writes a policy without learning, to which trained policies are compared.
+"""Writes a policy that was not trained, as a baseline for trained policies.
 
 `python -m benchmarks.baselines out=FILE.npz` writes a policy that `swarmjax.evaluate
 policy=FILE.npz` evaluates like any other. It drives straight to the target and ignores the infrared

@@ -99,7 +99,7 @@ class _Watch:
             self.note("IMPORT", values[0].co_filename)
 
     def written(self, path: Path) -> None:
-        """Records a path that was written, unless it may be written."""
+        """Records a path that was written, unless it is in an allowed folder."""
         assert self.folder is not None
         allowed = (self.folder / _OUT, self.folder / _TMP, Path("/dev"))
         # A file without a name opens its folder.
@@ -215,7 +215,7 @@ def watched(folder: Path) -> Iterator[list[str]]:
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Has a command read a hostile file.
+    """Lets a command read a hostile file.
 
     Args:
       seed: seed of the file.

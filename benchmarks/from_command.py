@@ -10,7 +10,8 @@ JSON line for the empty caches and one for the filled caches, each with the medi
 `until=success` trains each seed with the existing caches, and stops as soon as robots on the last
 stage reach at least `stop_at` of the targets over a whole cohort of training episodes. The saved
 policy is then evaluated in MuJoCo C on the wheeled body. A line has the result, and the seconds
-until training measured the shares 0.90 and 0.95 and until the policy was saved, with compilation.
+until training measured the shares 0.90 and 0.95 and until the policy was saved. These times include
+compilation.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Evaluates learners during training, on its device and on the levels of `swarmjax.evaluate`."""
+"""Evaluates learners on the training device, on the levels of `swarmjax.evaluate`."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -104,9 +104,9 @@ def outcomes(
     """Runs an episode of each level with policies that are still in training.
 
     The function is pure: `jit` it with `world`, `ppo` and `steps` bound, and `vmap` it over the
-    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
-    together (E, or E times the number of seeds), because MJX-Warp sizes its memory of contacts for
-    that number. The world's `task.step_limit` is ignored.
+    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are
+    evaluated together (E, or E times the number of seeds), because MJX-Warp sizes its memory of
+    contacts for that number. The world's `task.step_limit` is ignored.
 
     Args:
       world: the compiled environment.

@@ -243,7 +243,7 @@ def load_policy(path: str | Path, extensions: Any = None) -> Policy:
 
 
 def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]] | None]:
-    """Returns settings as command-line words. Returns stages apart if no word can name them."""
+    """Returns settings as command-line words, and apart from them stages that no word can name."""
     rest = dict(settings)
     stage = rest.get("stage")
     stages = None if stage is None or isinstance(stage, str | Path) else _stages(rest.pop("stage"))

@@ -66,7 +66,7 @@ class SwarmState:
 
     @property
     def observation(self) -> Array:
-        """Input of the policy, [A, R, O]. Where an episode has just ended, that of the next."""
+        """Input of the policy, [A, R, O]; after an episode has ended, that of the next episode."""
         return self.arenas.observation
 
     @property

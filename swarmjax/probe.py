@@ -158,7 +158,7 @@ def _compile(program: Program[ProbeConfig], schedule: Schedule) -> Any:
 
 
 def play(program: Program, schedule: Schedule, stage: Array | np.int32, key: Array) -> Counts:
-    """Plays one whole episode in each arena, on new levels, as training begins.
+    """Plays one whole episode in each arena, on new levels, with the networks before training.
 
     An arena that ends early goes on with another episode, which does not count. Otherwise short
     episodes would count more often than long ones.
@@ -183,7 +183,7 @@ def play(program: Program, schedule: Schedule, stage: Array | np.int32, key: Arr
 
 
 def count(ended: Ended) -> Counts:
-    """Sums over the episodes of cohorts; `ended` is [T, A], with `robots`."""
+    """Sums over the ended episodes [T, A] that count; `ended` has `robots`."""
     assert ended.robots is not None
     outside = ended.robots.robot_steps == ended.steps[..., None]
     visited = ended.robots.present & (ended.robots.reached | ~outside)

@@ -131,7 +131,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
     Args:
       section: the settings.
       options: for each option, the key that decides whether it is read, and the values of that key
-        with which it is. With other values, the option must have its default.
+        for which it is read. For other values, the option must have its default.
 
     Raises:
       ConfigError: an option has another value than its default, and is not read.

@@ -1,4 +1,4 @@
-"""Curricula along axes: a stage, and easier values of its numbers, become a grid of stages.
+"""Curricula along axes: one stage and easier values of its numbers give a grid of stages.
 
 With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
 an axis is the stage's own, so the last stage is the stage itself. From one

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
-    """Returns the path of the export for each seed to export."""
+    """Returns the path to write, for each seed to export."""
     every, seed = trained.numbers, settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."
@@ -92,7 +92,7 @@ def _target(settings: ExportConfig, folder: Path) -> Path:
 
 
 def _default(settings: ExportConfig) -> str:
-    """Returns the default name of the export. With `step`, it is not that of the final policy."""
+    """Returns the default name of the export; with `step`, it differs from the final policy's."""
     name = Path(_NAMES[settings.format])
     return str(
         name if settings.step is None else name.with_stem(f"{name.stem}-step{settings.step}")

@@ -63,7 +63,7 @@ class Batch:
         group, or () without memory. With memory, the N samples of a group are ordered by step,
         [T S].
       begins: [G, N], whether an episode begins with the step; None without memory.
-      state: [G, N, P], numbers of order 1 that the critic sees in addition; () if there are none.
+      state: [G, N, P], what the critic sees in addition to the observation; () if nothing.
     """
 
     observation: jax.Array

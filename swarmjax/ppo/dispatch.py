@@ -34,7 +34,7 @@ def resolve(config: AlgoConfig, networks: Networks, sizes: Sizes) -> Backend:
     Args:
       config: Settings of the learner.
       networks: Actor and critic.
-      sizes: Sizes of what the networks see and do.
+      sizes: Sizes of observation, action and state.
 
     Returns:
       The backend.

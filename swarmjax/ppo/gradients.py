@@ -138,7 +138,7 @@ def _terms(
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Batch) -> tuple[Acted, jax.Array]:
-    """Runs actor and critic on samples, with a memory step by step; returns both outputs."""
+    """Runs actor and critic on samples, step by step if there is a memory; returns both outputs."""
     seen, state, memory = minibatch.observation, minibatch.state, minibatch.memory
     begins = minibatch.begins
     if begins is not None:

@@ -48,7 +48,7 @@ class Sizes(NamedTuple):
     Attributes:
       observation: O, numbers of an observation.
       action: U, numbers of an action.
-      state: P, numbers that the critic sees in addition.
+      state: P, numbers that the critic sees besides the observation.
     """
 
     observation: int
@@ -205,7 +205,7 @@ class Acted(NamedTuple):
 
 
 class _Network(nn.Module):
-    """The kinds of layers that both actor and critic have: from an observation to the features.
+    """The layers that actor and critic both have, from an observation to the features.
 
     The heads take the features. Actor and critic do not share weights.
 

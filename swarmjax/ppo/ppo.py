@@ -142,8 +142,8 @@ class PPO:
         Args:
           learner: the learner with the critic.
           observation: [..., O], raw.
-          state: [..., P], numbers of order 1 that the critic sees in addition; () if there are
-            none.
+          state: [..., P], what the critic sees in addition to the observation, scaled to order 1;
+            () if nothing.
           memory: [..., H], the critic's memory before the observation; () without memory.
 
         Returns:

@@ -150,7 +150,7 @@ def over_training(
 
 
 def colours(count: int) -> np.ndarray:
-    """Returns colours [count, 4] for stages or runs. None is too light to be seen on white."""
+    """Returns colours [count, 4] for stages or runs, all dark enough to be seen on white."""
     return colormaps["viridis"](np.linspace(0.0, 0.85, count))
 
 

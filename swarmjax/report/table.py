@@ -173,7 +173,8 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
     """Writes the settings that differ between lines, except those that follow from other settings.
 
-    Stages of one name are compared setting by setting. An own piece is written without its digest.
+    Stages of one name are compared setting by setting. An extension's piece is written without its
+    digest.
     """
     derived, written = keys(TrainConfig, derived=True).keys() - {"stage_name"}, []
     for key, value in mine.items():

@@ -69,7 +69,7 @@ class Claim(NamedTuple):
     Attributes:
       name: key of the claim in `claims.yaml`.
       quote: the paper's sentence, word for word.
-      where: the section of the paper that says it.
+      where: the section of the paper that makes the claim.
       criterion: what supports the claim, and what contradicts the claim.
       figures: figures and tables of the report that show whether the claim holds.
       readings: the readings; the first one, the primary reading, decides.
@@ -144,7 +144,7 @@ def _readings(
 
 
 def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
-    """Lists the ways to find the step from which success is steady, one per definition of it.
+    """Lists the ways to find when success becomes steady, one per definition of success.
 
     Args:
       stage: uses only the episodes of this stage; None for all.
@@ -169,7 +169,7 @@ def _steady(stage: str | None, axis: Axis) -> list[Source]:
 def _rewarded() -> list[Source]:
     """Lists the ways to find where the reward on the last stage nears its best value.
 
-    There are two, for the reward of robot 1 and for the mean reward, in each unit of the place.
+    There is one for each reward (of robot 1, mean of the robots) and each unit of the axis.
     """
     kinds = {"robot 1": measures.first_reward, "mean of the robots": measures.mean_reward}
     return [

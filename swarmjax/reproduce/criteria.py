@@ -37,7 +37,7 @@ def within(
 
 
 def about(number: float) -> Criterion:
-    """Makes the criterion that a place is approximately this number."""
+    """Makes the criterion that an episode number or step is approximately this number."""
     return partial(within, low=(1 - ABOUT) * number, high=(1 + ABOUT) * number, unit=PLACE)
 
 

@@ -40,7 +40,7 @@ def targets(log: RunLog) -> np.ndarray:
 
 
 def first_reward(log: RunLog) -> np.ndarray:
-    """Takes the cumulative reward [E] of robot 1, m. The paper's Figure 7 is "for one robot"."""
+    """Returns the cumulative reward [E] of robot 1, m. The paper's Figure 7 is "for one robot"."""
     return log.reward[:, 0]
 
 
@@ -172,8 +172,8 @@ def judged(
 def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
     """Counts how many more steps with something in range the last robot had than the first robot.
 
-    First and last are meant by arrival. The first robot finds no other robot at the targets. The
-    last robot finds all the others that have arrived.
+    First and last are in the order of arrival. The first robot finds no other robot at the targets.
+    The last robot finds all the others that have arrived.
 
     Args:
       data: the reproduction's data.

@@ -92,9 +92,9 @@ def _mean(values: np.ndarray, unit: Unit) -> str:
 
 
 def _summary(places: np.ndarray) -> tuple[str, str, str]:
-    """Writes the median and the interquartile mean of places, and how many seeds have a place.
+    """Writes the median and interquartile mean of steps or episodes, and how many seeds have one.
 
-    A seed without a place has inf.
+    A seed without one has inf.
     """
     return (
         PLACE.value(float(np.median(places))),

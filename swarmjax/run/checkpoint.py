@@ -199,7 +199,7 @@ def _orbax() -> Any:
 
 @functools.cache
 def _silence() -> None:
-    """Silences Orbax's messages about a file that cannot be written: our own sentence says it.
+    """Silences Orbax's messages about a file that cannot be written, since the run says it itself.
 
     Orbax then closes its event loop, but TensorStore still reports the other files to this loop.
     """

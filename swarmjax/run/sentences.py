@@ -1,4 +1,4 @@
-"""What a run says: what it trains, how it is going, how good the swarm is, and what comes next."""
+"""What a run prints: what it trains, its progress, how good the swarm is, what to do next."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -60,7 +60,7 @@ def nothing_left(settings: TrainConfig, update: int) -> str:
 
 
 def promotions(settings: TrainConfig, decisions: Iterable[Row]) -> Iterator[str]:
-    """Describes each change of stage. The other decisions are many and only go to the log."""
+    """Describes each change of stage. All other decisions are only in the log."""
     for entry in decisions:
         if "to" in entry:
             seed = f"seed {entry['seed']}, " if settings.seeds > 1 else ""

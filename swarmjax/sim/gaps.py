@@ -1,4 +1,4 @@
-"""Computes signed gaps between hulls and the objects around them, and counts contacts by them."""
+"""Computes signed gaps between hulls and objects, and counts contacts from these gaps."""
 
 from typing import Any
 

@@ -192,7 +192,7 @@ def _rubbing(friction: float) -> dict[str, Any]:
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
-    """Selects Euler, as servos are discrete; disables unused features, since they cost MJX time."""
+    """Selects Euler's method, as servos are discrete; disables unused features, which cost time."""
     if rubs:
         spec.option.cone = body.cone
     spec.option.timestep = timestep

@@ -106,7 +106,7 @@ def poses(physics: Physics, data: Data | PhysicsState) -> Array:
 
 
 def is_finite(data: Data) -> Array:
-    """Returns [] whether positions and velocities of the arena are finite."""
+    """Returns whether all positions and velocities of the arena are finite, []."""
     return jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
 
 

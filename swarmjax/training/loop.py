@@ -1,4 +1,4 @@
-"""The compiled training loop: rollout, advantages, PPO update, curriculum, n times.
+"""The compiled training loop: rollout, advantages, PPO update and curriculum, repeated n times.
 
 A call trains a chunk of n updates. This number is an argument, so one program serves every chunk
 size. The run is the same with any chunk size.
@@ -221,7 +221,7 @@ def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
 
 
 def _episode_metrics(ended: Ended, stage: Array, measures: Iterable[str]) -> Metrics:
-    """Sums over the episodes that ended in this update on the current training stage."""
+    """Sums results of the episodes that ended in this update on the current training stage."""
     mine = ended.stage == stage
 
     def total(x: Array) -> Array:

@@ -128,7 +128,7 @@ def schedule(config: ProgramConfig) -> Schedule:
 
 
 def groups(config: ProgramConfig, cores: int) -> int:
-    """Returns into how many equal groups the seeds are split; the groups run at the same time.
+    """Returns the number of equal groups of seeds; all groups run at the same time.
 
     Args:
       config: settings of the run.

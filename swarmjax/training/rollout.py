@@ -118,7 +118,7 @@ def draw_starts(
     Args:
       world: the compiled environment.
       stages: [S] stages of the curriculum.
-      stage: [W, A] index of the stage of each arena's first waiting episode, second, and so on.
+      stage: [W, A] index of the stage of each waiting episode, W for each arena.
       cohort: [] number of the cohort for which the episodes count, int32.
       key: random key for the levels, consumed.
       shards: how the arenas are spread over devices; A is the number of arenas on this device.

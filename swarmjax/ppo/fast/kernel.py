@@ -1,4 +1,4 @@
-"""A kernel that takes samples through a network and a loss, and gradients back, on the chip.
+"""A kernel that computes a network's loss and its gradient, with all activations on the chip.
 
 XLA writes the activations of every layer to memory and reads them again. Here a program of the grid
 keeps the activations of a tile of samples on the chip. A program writes only sums, when it ends.

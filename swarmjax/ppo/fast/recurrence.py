@@ -1,4 +1,4 @@
-"""Kernels that take a GRU through sequences, and its gradient back, on the chip.
+"""Kernels that run a GRU over sequences, and backpropagate through it, on the chip.
 
 XLA launches several kernels for each step of a sequence, and passes data between them through the
 GPU's memory. Here a program of the grid holds a tile of sequences and their memory, and runs all

@@ -102,9 +102,9 @@ def kernels_of(solve: Any) -> Any:
     """Makes two kernels that compute the accelerations of the robots in many arenas.
 
     Args:
-      solve: a Warp function that takes a `WarpArena` and the first of the contacts to solve. At the
-        call, `total` of the arena equals `free`. The function sets `total` of the robots in these
-        contacts.
+      solve: a Warp function that takes a `WarpArena` and the first of the contacts to solve. When
+        it is called, `total` of the arena equals `free`. The function sets `total` of the robots in
+        these contacts.
 
     Returns:
       Two kernels for `launch`: the first one lists the contacts itself, the second one gets a list

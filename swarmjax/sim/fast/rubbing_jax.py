@@ -1,4 +1,4 @@
-"""Solves contacts of planar robots with friction, in JAX; `planar_jax` is for no friction.
+"""Solves contacts of planar robots with friction, in JAX; `planar_jax` those without friction.
 
 A contact has two forces: a push along the normal and a rub along the face, within the cone |rub| <=
 friction * push. This is MuJoCo's elliptic cone with condim 3. The third force of condim 3 is

@@ -32,7 +32,7 @@ _MISS = wp.constant(float("inf"))
 
 
 def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, limit: float) -> Array:
-    """Looks around from each robot of an arena; under `vmap`, one kernel computes all arenas.
+    """Finds what surrounds each robot of an arena; under `vmap`, one kernel computes all arenas.
 
     Args:
       scene: an arena.
@@ -51,7 +51,7 @@ def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, lim
 def _look(
     poses: Sequence[Sequence[float]], hull_radius: float, limit: float, scene: Scene
 ) -> Array:
-    """Looks around from each robot of A arenas; returns [A, K + 3, R, 2] as `look` does."""
+    """Finds what surrounds each robot of A arenas; returns [A, K + 3, R, 2] as `look` does."""
     pose, side, obstacle, turn, shades = scene
     (arenas, robots), rows = pose.shape[:2], len(poses) + len(KINDS)
     threads = min(rows, max(1, _THREADS // (arenas * robots)))
@@ -91,7 +91,7 @@ def _cells(pose: Array, hull_radius: float, limit: float) -> tuple[Array, Array]
 
 @wp.struct
 class WarpLook:
-    """What a thread needs to look around from one robot, and where it writes what it finds.
+    """What a thread needs to find what surrounds one robot, and where it writes the result.
 
     Attributes:
       place: x (m), y (m), yaw (rad).
