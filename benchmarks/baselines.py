@@ -1,8 +1,8 @@
 """Writes a policy that was not trained, as a baseline for trained policies.
 
 `python -m benchmarks.baselines out=FILE.npz` writes a policy that `swarmjax.evaluate
-policy=FILE.npz` evaluates like any other. It drives straight to the target and ignores the infrared
-sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
+policy=FILE.npz` evaluates like any other. The policy drives straight to the target and ignores the
+infrared sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
 """
 
 import sys

@@ -1,8 +1,8 @@
 """Test rig of `benchmarks.fidelity`, class of its rows, and the rows about the robot at rest.
 
-The rig is one robot in a square arena of MuJoCo's C engine, at given wheel speeds. It measures the
-robot's motion and the forces of walls on it, with the model that training and the judge share. No
-function of the rig uses the expected results.
+The rig is one robot in a square arena of MuJoCo's C engine, at given wheel speeds. The rig measures
+the robot's motion and the forces of walls on it, with the model that training and the judge share.
+No function of the rig uses the expected results.
 """
 
 import math

@@ -45,8 +45,8 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
 
     Args:
-      world: the compiled environment. Its config has this stage, or a stage with obstacles of the
-        same size.
+      world: the compiled environment. The world's config has this stage, or a stage with obstacles
+        of the same size.
       stage: stage of the levels.
       seed: seed of the evaluation.
       episodes: E.

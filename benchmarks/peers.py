@@ -6,7 +6,7 @@
 `paper_way` train our robots in MuJoCo C (`benchmarks.peer_mujoco_c`). The peer's functions say
 which keys it has and how it is measured.
 
-A peer is installed as an optional extra of this package or from `torch-peers.txt`. If it is
+A peer is installed as an optional extra of this package or from `torch-peers.txt`. If a peer is
 missing, the command prints one line with the reason as `skipped`, and exits with code 0.
 """
 

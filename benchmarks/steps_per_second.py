@@ -220,7 +220,8 @@ def settle(prepared: Prepared) -> rollout.Arena:
     """Steps the environment until its arenas are at all points of an episode.
 
     Returns:
-      The arenas after at least one step limit. Their clocks started evenly spread over this limit.
+      The arenas after at least one step limit. The arenas' clocks started evenly spread over the
+      step limit.
     """
     settings = prepared.program.config
     arenas: rollout.Arena = prepared.start(prepared.schedule).arenas

@@ -26,7 +26,7 @@ def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> 
     """Prints a text and the block's running time every `EVERY_S`, and hides XLA's advice.
 
     Another process filters standard error, so that the last words of a process that crashes are
-    printed too. It has a session of its own, so that Ctrl-C does not end it.
+    printed too. The filter has a session of its own, so that Ctrl-C does not end it.
     """
     ended, began = threading.Event(), time.monotonic()
 

@@ -1,7 +1,7 @@
 """`python -m swarmjax.probe stage=... key=value`: how often an untrained swarm succeeds by chance.
 
-It takes the words of `swarmjax.train`, drives the networks that this training would begin with, and
-writes no files. It says whether training on the last stage alone can begin.
+The probe takes the words of `swarmjax.train`, drives the networks that this training would begin
+with, and writes no files. It says whether training on the last stage alone can begin.
 
 Examples:
   # the default curriculum, stage by stage

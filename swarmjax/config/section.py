@@ -150,7 +150,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
 class ByName(dict[str, Any]):
     """A mapping from names, which no section defines, to values.
 
-    It is never changed, so that settings are hashable.
+    A `ByName` is never changed, so that settings are hashable.
     """
 
     def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

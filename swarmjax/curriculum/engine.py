@@ -1,7 +1,8 @@
 """The protocol of a curriculum, and how success is measured for every curriculum.
 
-A curriculum chooses the stages of the next episodes, and observes how episodes ended. Both are pure
-functions of the curriculum's own state, and run on the device. `stages.py` has the built-in modes.
+A curriculum chooses the stages of the next episodes, and observes how episodes ended. Choosing and
+observing are pure functions of the curriculum's own state, and run on the device. `stages.py` has
+the built-in modes.
 
 Success is measured on each stage, without favouring short episodes. A cohort holds all episodes
 that began within a period as long as the step limit of an episode. The verdict on a cohort comes

@@ -106,9 +106,9 @@ def assign(weights: Array, turn: Array, arenas: int) -> Array:
     The weights divide a line into stages. Arena a is at the point (a + u) / A of this line,
     with u within 0..1. So a stage's weight is its share of the arenas, and also its share of time.
     From cohort to cohort, u moves by the golden ratio. If there are few arenas, each arena visits
-    every stage over time. If there are many arenas, most of them stay on their stage. That matters
-    because an arena that moves must wait until its episode ends. If all arenas moved, stages with
-    long episodes would get more than their share.
+    every stage over time. If there are many arenas, most of them stay on their stage. Few arenas
+    should move, because an arena that moves must wait until its episode ends. If all arenas moved,
+    stages with long episodes would get more than their share.
 
     Args:
       weights: [S] share of the arenas on each stage.
@@ -219,11 +219,11 @@ def frontier(
 ) -> StageChoice:
     """Trains the open stages that are not learned, and keeps some arenas on learned stages.
 
-    A stage is learned while its running success is at least its `threshold`. It is open while all
-    stages one step easier are learned. So success widens the frontier, failure narrows it, and no
-    budget moves it. The last stage stays in training once it is open. Widening each axis by its own
-    success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube with a
-    Robot Hand", arXiv:1910.07113, section 5).
+    A stage is learned while its running success is at least its `threshold`. A stage is open while
+    all stages one step easier are learned. So success widens the frontier, failure narrows it, and
+    no budget moves it. The last stage stays in training once it is open. Widening each axis by its
+    own success is the idea of automatic domain randomization (OpenAI 2019, "Solving Rubik's Cube
+    with a Robot Hand", arXiv:1910.07113, section 5).
 
     Args:
       state: as in `promoting`.

@@ -73,8 +73,8 @@ class Recording(Frames):
 
     Attributes:
       scene: The parts that do not move.
-      reward: [N, R] weighted reward, by term, of the control step that led to the frame. It is 0
-        at the start and, with `task.arrival=latch`, after the robot's arrival.
+      reward: [N, R] weighted reward, by term, of the control step that led to the frame. The reward
+        is 0 at the start and, with `task.arrival=latch`, after the robot's arrival.
       arrival: [R] control steps until the robot arrived, or 0 if it never arrived. With
         `task.arrival=hold`, control steps until the robot was within its target to stay.
     """
@@ -215,7 +215,7 @@ def _measure_paths(level: Level, pose: np.ndarray, hull_radius: float) -> np.nda
 def _since(arrived: np.ndarray) -> np.ndarray:
     """Finds for each robot [R] the row of `arrived` [N, R] from which on all rows are True.
 
-    It is 0 for a robot that has not arrived in the last row.
+    The result is 0 for a robot that has not arrived in the last row.
     """
     away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside
     return np.where(arrived[-1], away + 1, 0)

@@ -108,7 +108,7 @@ class History:
     def success(self) -> np.ndarray:
         """The success [N, T, S] by which the curriculum decides.
 
-        It is the share of targets that were reached, or the share of episodes in which all robots
+        Success is the share of targets that were reached, or of episodes in which all robots
         arrived.
         """
         return self.by_stage[self.decided_by]
@@ -163,9 +163,9 @@ def read(run: Path) -> History:
 def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
     """Reads the values that a report needs from each row, by seed and update.
 
-    They become arrays, which need less memory than lists. `lists` [K, S] has the values of the K
-    keys in `_LISTS`. `curves` has those of `CURVES` and of the goal's first own measure, which
-    `names` lists. nan stands for null.
+    The values become arrays, which need less memory than lists. `lists` [K, S] has the values of
+    the K keys in `_LISTS`. `curves` has those of `CURVES` and of the goal's first own measure,
+    which `names` lists. nan stands for null.
     """
     by_seed: dict[int, dict[int, Row]] = {}
     for where, row in read_lines(run, METRICS):

@@ -3,11 +3,11 @@
 The criteria that support or contradict a claim were fixed before any data existed;
 `templates/claims.yaml` states them. A claim has one reading for each way to understand the paper
 (docs/paper.md). The first reading is the primary reading, which was named before the data of fifty
-seeds existed. It alone decides; the report shows the other readings beside it. Every number is an
-interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if its primary
-reading holds, and not reproduced if the data contradict the primary reading. It is undecidable if
-the interval straddles the limit or an arm is missing. A reproduction with less than the paper's
-budget gives no verdicts.
+seeds existed. The primary reading alone decides; the report also shows the other readings. Every
+number is an interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced
+if its primary reading holds, and not reproduced if the data contradict the primary reading. The
+claim is undecidable if the interval straddles the limit or an arm is missing. A reproduction with
+less than the paper's budget gives no verdicts.
 """
 
 from collections.abc import Callable, Iterable

@@ -92,9 +92,10 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
 def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> int | None:
     """Finds where success becomes steady.
 
-    This is the first episode that meets three conditions. In the window that starts with this
-    episode, at least `share` of the episodes succeed. The same holds for all episodes from this one
-    to the end of the run, taken together. In no later window do fewer than `KEPT` of them succeed.
+    Success is steady from the first episode that meets three conditions. In the window that starts
+    with this episode, at least `share` of the episodes succeed. The same holds for all episodes
+    from this one to the end of the run, taken together. In no later window do fewer than `KEPT` of
+    them succeed.
 
     Later windows need not reach `share`, because such a rule would measure the length of the run: a
     policy that succeeds in nine of ten episodes has fewer than 16 successes in one of 23 windows,

@@ -1,8 +1,8 @@
 """Builds the MuJoCo model of one arena: robots, obstacles and walls.
 
 Stages differ only in poses and sizes: the arena's side, the obstacles, and which robots and
-obstacles are present. These are set at run time, so the model is compiled only once, for the
-largest case. This module uses MuJoCo only, no JAX.
+obstacles are present. Poses and sizes are set at run time, so the model is compiled only once, for
+the largest case. This module uses MuJoCo only, no JAX.
 """
 
 import copy

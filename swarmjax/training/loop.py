@@ -1,7 +1,7 @@
 """The compiled training loop: rollout, advantages, PPO update and curriculum, repeated n times.
 
-A call trains a chunk of n updates. This number is an argument, so one program serves every chunk
-size. The run is the same with any chunk size.
+A call trains a chunk of n updates. n is an argument, so one program serves every chunk size. The
+run is the same with any chunk size.
 """
 
 from collections.abc import Iterable

@@ -319,8 +319,8 @@ def learn(
     of devices as well as on the random streams.
 
     Here each network is one vector, and the optimiser's state for each network is also one vector.
-    Otherwise there would be two dozen small arrays, and most kernels of a minibatch would handle
-    only one of them.
+    With a tree of two dozen small arrays instead, most kernels of a minibatch would handle only one
+    array.
 
     Args:
       learning: Settings and networks that `fits` accepts, and the optimiser.

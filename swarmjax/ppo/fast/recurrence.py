@@ -99,7 +99,7 @@ def fits(size: int, shared_memory: int) -> bool:
     """Tells whether the kernels support a memory of this width on this chip.
 
     The chip's memory holds the recurrent weights twice: the second copy is transposed for the
-    backward pass. It also holds four tiles of memories and derivatives.
+    backward pass. The chip also holds four tiles of memories and derivatives.
 
     Args:
       size: H.

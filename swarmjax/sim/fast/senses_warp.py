@@ -1,9 +1,9 @@
 """Finds what surrounds each robot, in one Warp kernel instead of several XLA kernels.
 
-The results equal those of `infrared` and `gaps`. A thread computes rays and gaps of one robot. It
-looks only at other robots in the cells around this robot (`cells_warp`), and skips boxes that are
-too far away. XLA would compute each ray to each box, and would sort the robots to list those near
-each robot.
+The results equal those of `infrared` and `gaps`. A thread computes rays and gaps of one robot. The
+thread looks only at other robots in the cells around this robot (`cells_warp`), and skips boxes
+that are too far away. XLA would compute each ray to each box, and would sort the robots to list
+those near each robot.
 """
 
 # Warp's types know neither the arguments of a struct nor those of an array.

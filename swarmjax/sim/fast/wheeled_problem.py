@@ -200,9 +200,10 @@ def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
     Args:
       problem: the problem.
       arena: index of the arena.
-      side: three numbers. The first is the index of the robot or of the row, and is not read here.
-        The second is the place of the body's six entries, which are stored from the last joint to
-        the first. The third is the wheel with an entry before those six entries.
+      side: three numbers. The first number is the index of the robot or of the row, and is not read
+        here. The second number is the place of the body's six entries, which are stored from the
+        last joint to the first. The third number is the wheel with an entry before those six
+        entries.
     """
     found = Vector()
     for i in range(6):
