@@ -25,7 +25,7 @@ AHEAD, SIDES = (1.0, 0.0), ((-2.0, 2.0), (-2.0, -2.0))
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinesConfig(Section):
-    """Settings: where the policy goes."""
+    """Settings: where to write the policy."""
 
     out: str = field(metadata=about("file .npz for the policy"))
 

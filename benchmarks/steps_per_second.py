@@ -190,7 +190,7 @@ def _line(
 
 
 def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
-    """Returns the entries of a result line that describe the simulation and what a step counts.
+    """Returns the entries of a result line that describe the simulation and what a step includes.
 
     Args:
       settings: settings of training.

@@ -1,4 +1,4 @@
-"""Times compiled programs, and compares the training speed of two trees or of two settings.
+"""Times compiled programs, and compares the training speed of two checkouts or two settings.
 
 `python -m benchmarks.timing [before=DIR] [than='key=value ...'] [key=value ...]` takes the keys of
 `swarmjax.train`. Two processes train in turn, `PAIRS` times: one with the code in `before`, a

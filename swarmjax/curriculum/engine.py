@@ -280,7 +280,7 @@ def init_cohorts(stages: int) -> Cohorts:
 
 
 def no_verdict(stages: int) -> CohortVerdict:
-    """Returns what is known of S stages before the first update."""
+    """Returns the verdict on S stages before the first update, which is empty."""
     record = init_cohorts(stages).record
     return CohortVerdict(jnp.array(True), jnp.zeros(stages, bool), record.success, record)
 

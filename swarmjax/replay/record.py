@@ -76,7 +76,7 @@ class Recording(Frames):
       reward: [N, R] weighted reward, by term, of the control step that led to the frame. The reward
         is 0 at the start and, with `task.arrival=latch`, after the robot's arrival.
       arrival: [R] control steps until the robot arrived, or 0 if it never arrived. With
-        `task.arrival=hold`, control steps until the robot was within its target to stay.
+        `task.arrival=hold`, control steps until the robot reached its target for good.
     """
 
     scene: ReplayScene

@@ -132,7 +132,7 @@ def _final_and_late(key: str, of: Measure) -> list[Source]:
 
 
 def _named(what: str, sources: Iterable[Source]) -> list[Source]:
-    """Puts the name of the quantity before the names of its sources."""
+    """Puts the name of the quantity in front of each source's name."""
     return [(f"{what}, {name}", values) for name, values in sources]
 
 

@@ -107,7 +107,7 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
       share: share of successes that a window must have.
 
     Returns:
-      Index of the episode; None if there is none.
+      Index of that episode; None if success never becomes steady.
     """
     # Compares counts, since 16 / 20 must equal 0.8; the small number absorbs rounding.
     counts = rolling(success.astype(float), window) * window

@@ -217,7 +217,7 @@ def _see_box(look: WarpLook, obstacle: wp.array[float], shade: float) -> None:
 
 @wp.func
 def _see(look: WarpLook, row: int, distance: float, shade: float) -> None:
-    """Updates a row if a surface is nearer, or brighter at the same distance, than its own."""
+    """Updates a row if a surface is nearer than the row's, or as near and brighter."""
     before = look.found[row, look.robot]
     if distance < before[0]:
         look.found[row, look.robot] = wp.vec2(distance, shade)
