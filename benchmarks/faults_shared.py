@@ -2,8 +2,8 @@
 
 A trial writes a recipe, a stage, a robot, a suite or a policy that tries to run a file, call a
 socket, read the environment or write somewhere. A command then reads it. Most trials do only the
-first part of a command, in this process; one of `_EVERY` runs the whole command as a process. The
-outcome names what the command must not do: IMPORT, SOCKET, ENVIRONMENT or WRITE. Otherwise the
+first part of a command, in this process; one trial in `_EVERY` runs the whole command as a process.
+The outcome names what the command must not do: IMPORT, SOCKET, ENVIRONMENT or WRITE. Otherwise the
 command runs, or refuses the file in one sentence within `MOST_SECONDS` of processor time.
 """
 

@@ -185,8 +185,9 @@ def _rewarded() -> list[Source]:
 def _expanded(test: Criterion, which: slice) -> tuple[Reading, ...]:
     """Makes the readings for the 1.5 m arena.
 
-    The arms that continued their training in this arena come first, because Figure 9 shows episodes
-    and "converge" speaks of training. The arms that never trained there (zero-shot) come second.
+    The arms that continued their training in this arena come first, because Figure 9 shows
+    episodes, and the paper's word "converge" is about training. The arms that never trained there
+    (zero-shot) come second.
     """
     values = partial(measures.judged, key="targets_reached", stage=EXPANDED)
     by_mean = partial(values, action="mean")
