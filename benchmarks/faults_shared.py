@@ -102,7 +102,7 @@ class _Watch:
         """Records a path that was written, unless it is in an allowed folder."""
         assert self.folder is not None
         allowed = (self.folder / _OUT, self.folder / _TMP, Path("/dev"))
-        # A file without a name opens its folder.
+        # Making a file without a name opens its folder.
         if path != self.folder and not any(root in (path, *path.parents) for root in allowed):
             self.note("WRITE", path)
 

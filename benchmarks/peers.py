@@ -212,7 +212,7 @@ def main(words: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    # The peers' modules raise the error of the imported module, which `__main__` is not.
+    # The peers' modules raise the `MissingPeerError` of `benchmarks.peers`, not of `__main__`.
     from benchmarks import peers
 
     sys.exit(peers.run("peers", peers.main, WhoConfig))

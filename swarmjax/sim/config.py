@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim import sensors
 
 # m; wider hulls make wider passages (`passage` in task/stage_config.py). A passage for this hull is
-# 0.41 m wide, a tenth of the largest arena's side.
+# 0.41 m wide, a tenth of the side of a 4 m arena.
 LARGEST_HULL = 0.15
 _HULL_REASON = (
     "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"

@@ -29,7 +29,7 @@ MOST_WIDTH = 128
 # counts what the matrix products of capability 9.0 take; those of other capabilities take up to 4
 # KiB more.
 SHARED_MEMORY = 95 * 1024
-# The same for chips where a program may use more, by compute capability; from the same source.
+# Bytes for chips where a program may use more, by compute capability; from the same source.
 _MORE_SHARED_MEMORY = {"8.0": 163 * 1024, "9.0": 227 * 1024, "10.0": 227 * 1024}
 
 
