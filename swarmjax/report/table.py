@@ -220,7 +220,7 @@ def text(lines: Sequence[TableLine]) -> str:
             written.append("  ".join(map(str.ljust, parts, widths)).rstrip())
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
-        f"Success: {measures} on the last stage, in the newest episodes that began within one step "
-        f"limit; mean over seeds and 95 % bootstrap interval, which needs {LEAST_DRAWN} seeds."
+        f"Success: {measures} on the last stage, in the newest episodes that began within a step "
+        f"limit; mean over seeds and 95 % bootstrap interval, for {LEAST_DRAWN} seeds or more."
     )
     return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])
