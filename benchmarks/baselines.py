@@ -1,8 +1,8 @@
-"""Writes a policy without learning, to which trained policies are compared.
+"""Writes a policy that was not trained, as a baseline for trained policies.
 
 `python -m benchmarks.baselines out=FILE.npz` writes a policy that `swarmjax.evaluate
-policy=FILE.npz` judges like any other. It drives straight to the target and ignores the infrared
-sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
+policy=FILE.npz` evaluates like any other. The policy drives straight to the target and ignores the
+infrared sensors: the turn rate is twice the bearing, and the speed falls with the bearing.
 """
 
 import sys
@@ -25,7 +25,7 @@ AHEAD, SIDES = (1.0, 0.0), ((-2.0, 2.0), (-2.0, -2.0))
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinesConfig(Section):
-    """Settings: where the policy goes."""
+    """Settings: where to write the policy."""
 
     out: str = field(metadata=about("file .npz for the policy"))
 

@@ -48,7 +48,7 @@ class Campaign(NamedTuple):
 
 
 CAMPAIGNS: dict[str, Campaign] = {
-    "kills": Campaign(faults_runs.kills, 50),  # each trial has four kills
+    "kills": Campaign(faults_runs.kills, 50),  # each trial kills a run four times
     "terms": Campaign(faults_runs.terms, 50),
     "checkpoints": Campaign(faults_runs.checkpoints, 2000),
     "disk": Campaign(faults_disk.trial, 40),

@@ -50,7 +50,7 @@ SEEDS = 4  # number of undisturbed runs per stage; every trial has the seed of o
 SHARES = (0.01, 0.1, 1.0)  # shares of the arenas, or of an array's numbers, that are spoilt
 VALUES = {"nan": np.nan, "inf": np.inf, "-inf": -np.inf}
 HUGE = 1e30  # m; the reward stays finite, but its gradient does not
-# Arrays that a fault spoils in some arenas; `gradient` makes a reward whose square is infinite.
+# Arrays that a fault spoils in some arenas. `gradient` sets a reward whose square is infinite.
 IN_ARENAS = ("qpos", "qvel", "observation", "distance", "return", "gradient")
 IN_LEARNERS = ("params", "optimizer_state")
 KINDS = (*IN_ARENAS, *IN_LEARNERS)
@@ -75,7 +75,7 @@ def trial(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _judge_disk(kind: str, told: dict[str, Any], run: Path) -> dict[str, Any]:
-    """Resumes the run until it ends, and judges whether it lost anything."""
+    """Resumes the run until it ends, and checks whether it lost anything."""
     if "missing" in told:
         return {"outcome": "not tried", "kind": kind, **told}
     process = start(run)
@@ -264,7 +264,7 @@ def success(metrics: dict[str, np.ndarray]) -> float:
 
 
 def spoil(seed: int, folder: Path) -> dict[str, Any]:
-    """Puts one fault into a run, and judges how the training continues.
+    """Puts one fault into a run, and records how the training continues.
 
     Args:
       seed: Seed of the trial.

@@ -141,7 +141,7 @@ _NASTY = [
 
 
 def _write_files(draw: random.Random) -> None:
-    """Writes the files that are named in words to the working folder; damages at most one file."""
+    """Writes the files that the words name into the working folder; damages at most one file."""
     faults_policies.write_sound(Path("policy.npz"), draw)
     faults_policies.write_sound(Path("b.npz"), draw)
     Path("mine.yaml").write_text(_STAGE)
@@ -313,7 +313,7 @@ def process(name: str, command: Words, folder: Path) -> tuple[str, str]:
 
     Args:
       name: name of the command.
-      command: what follows the interpreter, with the words.
+      command: arguments of the Python interpreter, including the words.
       folder: folder of the files that the words name.
 
     Returns:

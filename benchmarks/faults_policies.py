@@ -1,4 +1,4 @@
-"""A campaign of `benchmarks.faults` that damages policy files and has both readers read them.
+"""A campaign of `benchmarks.faults` that damages policy files and tests both readers (`READERS`).
 
 The campaign records which files each reader accepts, and how much time and memory each reader
 takes. NumPy also reads each accepted file, and a separate function computes the file's digest. If

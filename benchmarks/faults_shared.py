@@ -2,8 +2,8 @@
 
 A trial writes a recipe, a stage, a robot, a suite or a policy that tries to run a file, call a
 socket, read the environment or write somewhere. A command then reads it. Most trials do only the
-first part of a command, in this process; one of `_EVERY` runs the whole command as a process. The
-outcome names what the command must not do: IMPORT, SOCKET, ENVIRONMENT or WRITE. Otherwise the
+first part of a command, in this process; one trial in `_EVERY` runs the whole command as a process.
+The outcome names what the command must not do: IMPORT, SOCKET, ENVIRONMENT or WRITE. Otherwise the
 command runs, or refuses the file in one sentence within `MOST_SECONDS` of processor time.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks import faults_inputs, faults_policies
 
-MOST_SECONDS = 5.0  # of processor time, until a file is refused
+MOST_SECONDS = 5.0  # s of processor time until a file is refused
 _EVERY = 50  # one of this many trials runs a whole command
 _SECRET = "SWARMJAX_SECRET"
 _EVIL = "evil.py"
@@ -99,15 +99,15 @@ class _Watch:
             self.note("IMPORT", values[0].co_filename)
 
     def written(self, path: Path) -> None:
-        """Notes a path that is written, unless it may be."""
+        """Records a path that was written, unless it is in an allowed folder."""
         assert self.folder is not None
         allowed = (self.folder / _OUT, self.folder / _TMP, Path("/dev"))
-        # A file without a name opens its folder.
+        # Making a file without a name opens its folder.
         if path != self.folder and not any(root in (path, *path.parents) for root in allowed):
             self.note("WRITE", path)
 
     def note(self, what: str, detail: object) -> None:
-        """Notes something that must not happen."""
+        """Records something that the trial must not do."""
         self.seen.append(f"{_SEEN}{what} {detail}")
         if __name__ == "__main__":  # the parent reads it
             os.write(2, f"\n{_SEEN}{what} {detail}\n".encode())
@@ -215,7 +215,7 @@ def watched(folder: Path) -> Iterator[list[str]]:
 
 
 def trial(seed: int, folder: Path) -> dict[str, Any]:
-    """Has a command read a hostile file.
+    """Lets a command read a hostile file.
 
     Args:
       seed: seed of the file.

@@ -3,8 +3,8 @@
 `python -m benchmarks.fidelity [out=FILE]` measures both bodies in MuJoCo's C engine and prints one
 table. `out` writes JSON lines: first a line with versions and commit, then a line for each row.
 
-Our numbers are read from the compiled model or from the simulated robot's motion. The benchmark
-writes the reference numbers down a second time, each with its source. If the robot and the
+Our numbers are read from the compiled model or from the simulated robot's motion. The files of this
+benchmark hold the reference numbers a second time, each with its source. If the robot and the
 reference took a number from the same line of code, the comparison would prove nothing. Where a
 source differs from Webots' own numbers, the error shows the spread between sources.
 """

@@ -303,7 +303,7 @@ def _noise() -> list[Row]:
 def residuals() -> np.ndarray:
     """Returns measured minus fitted counts, [K, 8].
 
-    Zeroing removes the fit's counts in free space from the response, so they are added again.
+    The simulated response is without the fit's counts in free space, so they are added here.
     """
     free = np.array(epuck.INFRARED_FIT)[:, 2]
     fitted = at_gap(np.array(epuck.MEASURED_GAPS)).T + free[:, None]

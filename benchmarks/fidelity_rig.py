@@ -1,8 +1,8 @@
-"""Provides a test rig for `benchmarks.fidelity`, the rows of its table, and the robot at rest.
+"""Test rig of `benchmarks.fidelity`, class of its rows, and the rows about the robot at rest.
 
-The rig is one robot in a square arena of MuJoCo's C engine, at given wheel speeds. It measures the
-robot's motion and the forces of walls on it, with the model that training and the judge share. No
-function of the rig uses the expected results.
+The rig is one robot in a square arena of MuJoCo's C engine, at given wheel speeds. The rig measures
+the robot's motion and the forces of walls on it, with the model that training and the judge share.
+No function of the rig uses the expected results.
 """
 
 import math
@@ -293,7 +293,7 @@ def contact_radius(bench: Rig) -> float:
 
 
 def lowest(bench: Rig, names: Sequence[str]) -> float:
-    """Returns the height of the lowest point of the named spheres, with the robot put down, m."""
+    """Returns the height of the lowest point of the named spheres, with the robot at rest, m."""
     data, model = place(bench), bench.model
     geoms = [(data.geom(f"{BODY}_{n}").xpos[2], model.geom(f"{BODY}_{n}").size[0]) for n in names]
     return float(min(height - radius for height, radius in geoms))

@@ -5,12 +5,13 @@
 
 `until=update` stops the clock when the metrics of the first update are on the disk: once with empty
 caches of XLA and Warp, then `warm` times with the caches that the first run filled. It prints a
-JSON line for cold and one for warm caches, each with the median over its runs.
+JSON line for the empty caches and one for the filled caches, each with the median over its runs.
 
 `until=success` trains each seed with the existing caches, and stops as soon as robots on the last
 stage reach at least `stop_at` of the targets over a whole cohort of training episodes. The saved
-policy is then judged in MuJoCo C on the wheeled body. A line has this judgement, the seconds until
-training measured the shares 0.90 and 0.95, and until the policy was saved, with compilation.
+policy is then evaluated in MuJoCo C on the wheeled body. A line has the result, and the seconds
+until training measured the shares 0.90 and 0.95 and until the policy was saved. These times include
+compilation.
 """
 
 import json
@@ -166,7 +167,7 @@ def first_update(words: Sequence[str], run: Path, environment: dict[str, str]) -
 
 
 def starts(given: FromCommandConfig, words: Sequence[str]) -> Iterator[Row]:
-    """Measures starts with cold caches and with warm caches; yields a JSON line for each."""
+    """Measures starts with empty and with filled caches; yields a JSON line for each."""
     trained = load_train(words)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -214,7 +215,7 @@ def train(words: Sequence[str], run: Path, stop_at: float) -> tuple[dict[str, fl
 
 
 def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
-    """Judges a run's policy on wheels in MuJoCo C; returns its share of targets and action mode."""
+    """Evaluates a run's policy on wheels in MuJoCo C; returns share of targets and action mode."""
     path = run / POLICY
     settings = load_levels(
         EvaluateConfig,
@@ -227,7 +228,7 @@ def judge(run: Path, stage: str, episodes: int) -> dict[str, Any]:
 
 
 def successes(given: FromCommandConfig, words: Sequence[str]) -> Iterator[Row]:
-    """Trains and judges every seed; yields one line per seed."""
+    """Trains and evaluates every seed; yields one line per seed."""
     trained = load_train(words)
     for seed in given.seed:
         with tempfile.TemporaryDirectory() as name:

@@ -1,4 +1,4 @@
-"""Judges learners in training on the levels of `swarmjax.evaluate`, on the training device."""
+"""Evaluates learners on the training device, on the levels of `swarmjax.evaluate`."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -45,8 +45,8 @@ def draw_levels(world: World, stage: StageConfig, seed: int, episodes: int) -> L
     """Draws the levels of `swarmjax.evaluate`, padded to the world's robots and obstacles.
 
     Args:
-      world: the compiled environment. Its config has this stage, or a stage with obstacles of the
-        same size.
+      world: the compiled environment. The world's config has this stage, or a stage with obstacles
+        of the same size.
       stage: stage of the levels.
       seed: seed of the evaluation.
       episodes: E.
@@ -101,12 +101,12 @@ def outcomes(
     *,
     sampled: bool = False,
 ) -> Outcomes:
-    """Runs an episode of each level with policies in training.
+    """Runs an episode of each level with policies that are still in training.
 
     The function is pure: `jit` it with `world`, `ppo` and `steps` bound, and `vmap` it over the
-    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are judged
-    together (E, or E times the number of seeds), because MJX-Warp sizes its memory of contacts for
-    that number. The world's `task.step_limit` is ignored.
+    seeds of `learners`. With `impl=warp`, load the world for the number of arenas that are
+    evaluated together (E, or E times the number of seeds), because MJX-Warp sizes its memory of
+    contacts for that number. The world's `task.step_limit` is ignored.
 
     Args:
       world: the compiled environment.
@@ -114,7 +114,8 @@ def outcomes(
       learners: [L].
       levels: [E].
       steps: control steps of an episode, at least 1.
-      sampled: whether to draw the actions from the policies; otherwise they are their means.
+      sampled: whether to draw the actions from the policies; otherwise each action is the policy's
+        mean.
 
     Returns:
       [E] outcomes. If the physics of an episode breaks, the episode ends at that step, and its

@@ -3,16 +3,17 @@
 `python -m benchmarks.peers who=vmas|camar|jaxnav [arenas=4096,65536] [key=value ...]` prints a JSON
 line for each number of arenas. It times calls of `steps` control steps with random actions.
 
-- `vmas` is VMAS's navigation scenario, the PyTorch environment most similar to ours. It leaves
+- `vmas` is VMAS's navigation scenario, the PyTorch environment most similar to ours. VMAS leaves
   resets to the caller, so the timed calls have no resets. This is VMAS's best case. The line also
   has the time for resetting all arenas. It needs the packages in `torch-peers.txt`.
 - `camar` is the most similar to ours among the JAX environments for path finding in continuous
-  space, with differential drives. Its own wrapper resets arenas optimistically: each step draws one
-  new map per `reset_ratio` arenas, and the arenas whose episodes end in this step share these maps.
-- `jaxnav` is JaxMARL's environment of differential drives with range sensors. `step=pool` calls its
-  `step_env`, and restarts arenas from a pool of states that were drawn beforehand. This is JaxNav's
-  best case. `step=default` calls its own `step`, which draws a whole map for every arena and step,
-  and discards nearly all of these maps.
+  space, with differential drives. CAMAR's own wrapper resets arenas optimistically: each step draws
+  one new map per `reset_ratio` arenas, and the arenas whose episodes end in this step share these
+  maps.
+- `jaxnav` is JaxMARL's environment of differential drives with range sensors. `step=pool` calls
+  JaxNav's `step_env`, and restarts arenas from a pool of states that were drawn beforehand. This is
+  JaxNav's best case. `step=default` calls JaxNav's own `step`, which draws a whole map for every
+  arena and step, and discards nearly all of these maps.
 """
 
 from collections.abc import Iterator, Sequence

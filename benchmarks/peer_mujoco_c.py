@@ -41,7 +41,7 @@ _WARM = 200  # control steps of the warm-up cycle of `paper_way`
 
 
 def timed(call: Callable[[int], None], seconds: float) -> list[float]:
-    """Times calls, numbered from 0, until all but the first took `seconds`; returns their times."""
+    """Times calls until all but the first took `seconds` in total; returns the times of all."""
     taken: list[float] = []
     while len(taken) < 2 or sum(taken[1:]) < seconds:
         began = time.perf_counter()

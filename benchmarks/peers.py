@@ -6,7 +6,7 @@
 `paper_way` train our robots in MuJoCo C (`benchmarks.peer_mujoco_c`). The peer's functions say
 which keys it has and how it is measured.
 
-A peer is installed as an optional extra of this package or from `torch-peers.txt`. If it is
+A peer is installed as an optional extra of this package or from `torch-peers.txt`. If a peer is
 missing, the command prints one line with the reason as `skipped`, and exits with code 0.
 """
 
@@ -212,7 +212,7 @@ def main(words: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    # The peers' modules raise the error of the imported module, which `__main__` is not.
+    # The peers' modules raise the `MissingPeerError` of `benchmarks.peers`, not of `__main__`.
     from benchmarks import peers
 
     sys.exit(peers.run("peers", peers.main, WhoConfig))

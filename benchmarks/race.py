@@ -4,7 +4,7 @@
 keys of `swarmjax.train` and prints a JSON line for each seed. Both trainers use the same compiled
 environment, with the same networks, batch, minibatches, epochs, discount, clip range, costs and
 gradient clipping. They also initialise weights in the same way.
-The policies of both are judged with their mean actions on the same levels, at `points` points
+The policies of both are evaluated with their mean actions on the same levels, at `points` points
 evenly spaced over the budget.
 
 Brax differs in these points:
@@ -24,7 +24,7 @@ that it learns from.
 
 The reported seconds are training time alone. Brax compiles during its first two calls. For each of
 these two calls, the median time of the later calls counts as training, and the rest of the call
-counts as compiling. Judging is not timed.
+counts as compiling. Evaluation is not timed.
 """
 
 import math
@@ -79,7 +79,7 @@ _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
 @dataclass(frozen=True, kw_only=True)
 class RaceConfig(Section):
-    """Settings: which trainer, and how to judge it."""
+    """Settings: which trainer, and how to evaluate it."""
 
     trainer: Literal["swarmjax", "brax"] = field(
         default="swarmjax", metadata=about("whose PPO trains")
@@ -96,7 +96,7 @@ class RaceConfig(Section):
 
 
 class Course(NamedTuple):
-    """A trainer's results at the points where it was judged.
+    """A trainer's results at the points where it was evaluated.
 
     Attributes:
       train_s: [P] seconds of training up to each point.
@@ -129,7 +129,7 @@ def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
-    """Returns the evenly spaced updates [P] after which our trainer is judged."""
+    """Returns the evenly spaced updates [P] after which our trainer is evaluated."""
     return _evenly(race, trained.updates)
 
 
@@ -278,7 +278,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     seconds: list[float] = []
 
     def look(step: int, _: Any, params: Any) -> None:
-        """Judges the policy; the first call comes before training and compiles the judge."""
+        """Evaluates the policy; the first call comes before training and compiles the judge."""
         shares.append(judge(as_learners(trained, params)))
 
     with adapter.mended_jax():

@@ -60,7 +60,7 @@ class Prepared:
 
     Attributes:
       program: the parts of training that are fixed at compile time.
-      schedule: the curriculum's numbers, an argument of the compiled programs.
+      schedule: the curriculum's stages, deadlines and thresholds, an argument of all programs.
       start: makes the first state from the schedule.
       keys: [N] a random key for each seed.
       physics: program that steps the physics alone.
@@ -145,7 +145,7 @@ def environment(
         keys = jax.random.split(key, program.config.algo.rollout_length)
         return jax.lax.scan(partial(body, starts=starts), arenas, keys)
 
-    began = replace(arenas, sim=unpack(arenas.sim), recall=NO_MEMORY)  # random actions need none
+    began = replace(arenas, sim=unpack(arenas.sim), recall=NO_MEMORY)  # random: no memory
     keys = jax.random.split(key, _rollouts(program.config))
     ended, sums = jax.lax.scan(rolled, began, keys)
     packed = jax.vmap(physics.pack)(ended.sim)
@@ -190,7 +190,7 @@ def _line(
 
 
 def about(settings: TrainConfig, impl: str | None = None) -> dict[str, Any]:
-    """Returns the entries of a result line that describe the simulation and what a step counts.
+    """Returns the entries of a result line that describe the simulation and what a step includes.
 
     Args:
       settings: settings of training.
@@ -220,7 +220,8 @@ def settle(prepared: Prepared) -> rollout.Arena:
     """Steps the environment until its arenas are at all points of an episode.
 
     Returns:
-      The arenas after at least one step limit. Their clocks started evenly spread over this limit.
+      The arenas after at least one step limit. The arenas' clocks started evenly spread over the
+      step limit.
     """
     settings = prepared.program.config
     arenas: rollout.Arena = prepared.start(prepared.schedule).arenas

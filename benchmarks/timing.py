@@ -1,4 +1,4 @@
-"""Times compiled programs, and compares the training speed of two trees or of two settings.
+"""Times compiled programs, and compares the training speed of two checkouts or two settings.
 
 `python -m benchmarks.timing [before=DIR] [than='key=value ...'] [key=value ...]` takes the keys of
 `swarmjax.train`. Two processes train in turn, `PAIRS` times: one with the code in `before`, a
@@ -188,9 +188,9 @@ def median(values: Sequence[float]) -> tuple[float, float, float]:
     """Returns the median and an interval with at least 95 % probability for the true median.
 
     If the n values are independent, the number of values below the true median is distributed like
-    the number of heads in n coin tosses. This holds for any distribution of the values. The
-    interval runs from the k-th smallest to the k-th largest value. Here k is the largest number for
-    which the true median lies beyond either end with a probability of at most 2.5 %.
+    the number of heads in n coin tosses. The interval is valid for any distribution of the values.
+    The interval runs from the k-th smallest to the k-th largest value. Here k is the largest number
+    for which the true median lies beyond either end with a probability of at most 2.5 %.
 
     Args:
       values: at least 6 values.

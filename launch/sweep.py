@@ -50,7 +50,7 @@ MOST_CELLS = 256
 # Keys that the sweep sets for each cell.
 _OWN = ("resume", "run.dir", "run.distributed")
 _TICK_S = 1.0
-_SAVE_S = 180  # from the signal of Slurm to the end of a job
+_SAVE_S = 180  # s between Slurm's signal and a job's end
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
 """E-puck swarms in MuJoCo MJX: thousands of arenas, a curriculum and PPO in one compiled program.
 
-Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. They raise
-`SwarmjaxError` if an argument is invalid or a run breaks. Importing this package imports neither
-JAX nor NumPy.
+Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. These functions
+raise `SwarmjaxError` if an argument is invalid or a run breaks. Importing this package imports
+neither JAX nor NumPy.
 
 Every docstring uses these axes: `T` time, `A` arenas, `R` robots (the most in an arena), `K`
 infrared sensors, `O` observation entries, `U` = 2 entries of an action or command, `M` obstacles

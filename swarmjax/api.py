@@ -253,7 +253,7 @@ def _given(settings: Mapping[str, Any]) -> tuple[list[str], list[dict[str, Any]]
 
 
 def _stages(given: Any) -> list[dict[str, Any]]:
-    """Converts stages to plain data. They may be settings, mappings, or names in a list."""
+    """Converts stages to plain data. Stages may be settings, mappings, or names in a list."""
     from swarmjax.task import stage_files
 
     def plain(stage: Any) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def run(
       also: types of further errors that the user can fix.
 
     Returns:
-      The exit code. It is 2 for the user's errors, each of which is printed as one sentence.
+      The exit code: 2 for the user's errors, each of which is printed as one sentence.
     """
     module, arguments = _module(name), sys.argv[1:]
     try:

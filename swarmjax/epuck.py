@@ -1,8 +1,8 @@
 """Numbers of the e-puck, each with its unit and source.
 
-The frame has x forward, y left and z up. Its origin is on the floor midway between the wheels.
-Angles are in radians, counter-clockwise from +x. The numbers are restated from the named sources;
-the Webots model itself is not part of this project.
+The frame has x forward, y left and z up. The frame's origin is on the floor midway between the
+wheels. Angles are in radians, counter-clockwise from +x. The numbers are restated from the named
+sources; the Webots model itself is not part of this project.
 """
 
 import math

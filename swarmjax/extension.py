@@ -352,8 +352,8 @@ def _check(piece: Piece, where: str) -> None:
 def _sources(thing: Any, found: dict[str, str]) -> dict[str, str]:
     """Returns the syntax trees of a function or class, and of all that it uses from its file.
 
-    The trees lack docstrings. They also lack the decorator, because settings and layouts already
-    have its arguments.
+    The trees lack docstrings. They also lack the decorator, whose arguments settings and layouts
+    already have.
     """
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))

@@ -26,7 +26,7 @@ def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> 
     """Says every `EVERY_S` s a text and how long the block has run, and hides XLA's advice.
 
     Another process filters standard error, so that the last words of a process that crashes are
-    printed too. It has a session of its own, so that Ctrl-C does not end it.
+    printed too. The filter has a session of its own, so that Ctrl-C does not end it.
     """
     ended, began = threading.Event(), time.monotonic()
 
@@ -46,7 +46,8 @@ def shown(text: Callable[[], str], say: Callable[[str], object] = words.say) -> 
             os.dup2(stderr, 2)
             os.close(stderr)
             ended.set()
-            # Another thread waits, since a child that has begun here may hold the pipe open.
+            # Wait in a thread, since a child process that the block has started may hold the pipe
+            # open.
             threading.Thread(target=pipe.wait, daemon=True).start()
 
 

@@ -22,7 +22,8 @@ def replacing(path: Path) -> Iterator[Path]:
       OSError: if the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # It is in the same folder, so that the move stays within one file system and is atomic.
+    # The temporary file is in the same folder, so that the move stays within one file system and is
+    # atomic.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary

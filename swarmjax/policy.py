@@ -230,7 +230,7 @@ def _check(policy: Policy, memory: Any, observation: Any) -> None:
 def _remember(parts: list[Any], memory: Any, features: Any, xp: Any) -> Any:
     """Updates the memory with a gated recurrent unit (GRU).
 
-    Its reset gate multiplies the product of memory and recurrent weights, not the memory itself.
+    The reset gate multiplies the product of memory and recurrent weights, not the memory itself.
     """
 
     def logistic(x: Any) -> Any:

@@ -15,8 +15,8 @@ from swarmjax import extension
 class PolicyNetwork:
     """The part of a policy that turns normalised observations into the inputs of its last layers.
 
-    It takes [..., R, O] and returns features [..., R, F]. It can be sent to another process, which
-    then loads the extension again.
+    It takes [..., R, O] and returns features [..., R, F]. The network can be sent to another
+    process, which then loads the extension again.
     """
 
     def __init__(self, source: str, name: str, arrays: Mapping[str, np.ndarray]) -> None:

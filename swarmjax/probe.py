@@ -1,7 +1,7 @@
 """`python -m swarmjax.probe stage=... key=value`: how often an untrained swarm succeeds by chance.
 
-It takes the words of `swarmjax.train`, drives the networks that this training would begin with, and
-writes no files. It says whether training on the last stage alone can begin.
+The probe takes the words of `swarmjax.train`, drives the networks that this training would begin
+with, and writes no files. It says whether training on the last stage alone can begin.
 
 Examples:
   # the default curriculum, stage by stage
@@ -157,7 +157,7 @@ def _compile(program: Program[ProbeConfig], schedule: Schedule) -> Any:
 
 
 def play(program: Program, schedule: Schedule, stage: Array | np.int32, key: Array) -> Counts:
-    """Plays one whole episode in each arena, on new levels, as training begins.
+    """Plays one whole episode in each arena, on new levels, with the networks before training.
 
     An arena that ends early goes on with another episode, which does not count. Otherwise short
     episodes would count more often than long ones.
@@ -182,7 +182,7 @@ def play(program: Program, schedule: Schedule, stage: Array | np.int32, key: Arr
 
 
 def count(ended: Ended) -> Counts:
-    """Sums over the episodes of cohorts; `ended` is [T, A], with `robots`."""
+    """Sums over the ended episodes [T, A] that count; `ended` has `robots`."""
     assert ended.robots is not None
     outside = ended.robots.robot_steps == ended.steps[..., None]
     visited = ended.robots.present & (ended.robots.reached | ~outside)
@@ -207,7 +207,7 @@ def paid(task: TaskConfig) -> str:
 
 
 def _holds(task: TaskConfig) -> bool:
-    """Returns whether only robots that are within their targets at once are paid."""
+    """Returns whether robots are paid only if all are within their targets at the same time."""
     return task.arrival == "hold" and paid(task) == "all"
 
 

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _open_device(impl: str) -> None:
-    """Opens a GPU for JAX and Warp while the main thread imports its modules. This takes 2 s."""
+    """Opens a GPU for JAX and Warp while the main thread imports its modules. Opening takes 2 s."""
     with contextlib.suppress(Exception):  # the run meets the same error, and reports it
         import jax
         import numpy as np

@@ -23,8 +23,8 @@ class SwarmVectorEnv(_vector.VectorEnv):
 
     The sub-environments of an arena all end together, when the arena's episode ends. A robot that
     has arrived stands still until then: its reward is 0, `info["valid"]` is False, and its actions
-    are ignored. It is `terminated` in the last step of the episode. Robots that ran out of time are
-    `truncated` in that step.
+    are ignored. An arrived robot is `terminated` in the last step of the episode. Robots that ran
+    out of time are `truncated` in that step.
 
     Autoreset is `SAME_STEP`. When an episode ends, the returned observation belongs to the next
     episode, and `info["final_obs"]` holds the last observation of the old one.

@@ -22,10 +22,11 @@ class SwarmParallelEnv(_base):
             actions = {agent: env.action_space(agent).sample() for agent in env.agents}
             observations, rewards, terminations, truncations, infos = env.step(actions)
 
-    A robot that arrives is terminated and leaves `agents`. It stays where it is, and the other
-    robots drive around it. When the time runs out, the remaining agents are truncated. With
-    `task.arrival=hold`, all robots leave `agents` in the same step. When a robot leaves, its info
-    has `is_success`, which says whether the robot arrived. The environment never resets itself.
+    A robot that arrives is terminated and leaves `agents`. An arrived robot stays where it is, and
+    the other robots drive around it. When the time runs out, the remaining agents are truncated.
+    With `task.arrival=hold`, all robots leave `agents` in the same step. When a robot leaves, its
+    info has `is_success`, which says whether the robot arrived. The environment never resets
+    itself.
 
     Attributes:
       agents: the robots that are still on their way.

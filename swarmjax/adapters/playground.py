@@ -110,5 +110,5 @@ class SwarmMjxEnv(_playground.MjxEnv):
 
     @functools.cached_property
     def mjx_model(self) -> Any:
-        """The MuJoCo model on the device. It is made when it is first asked for."""
+        """The MuJoCo model on the device. This model is made when it is first asked for."""
         return find("mujoco.mjx", "playground").put_model(self.mj_model)

@@ -118,7 +118,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def _depth(value: object, above: int = 0) -> int:
-    """Returns how deep lists and objects are nested. It stops counting just beyond the maximum."""
+    """Returns how deep lists and objects are nested. Counting stops just beyond the maximum."""
     inner = list(value.values()) if isinstance(value, dict) else value
     if not isinstance(inner, list) or above > _MOST_DEPTH:
         return above

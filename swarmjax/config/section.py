@@ -1,4 +1,4 @@
-"""Sections of settings: strict conversion, bounds, and one-sentence errors.
+"""Sections of settings: converts and checks values, and refuses a mistake in one sentence.
 
 A section is a frozen dataclass. Each field carries its meaning and bounds as metadata (`setting`).
 `build` makes a section from plain data, and `to_dict` converts it back. This module does not know
@@ -126,7 +126,7 @@ class Section:
 
 
 def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[str]]]) -> None:
-    """Refuses an option that nothing would read.
+    """Refuses an option that has no effect with the other settings.
 
     Args:
       section: the settings.
@@ -150,7 +150,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
 class ByName(dict[str, Any]):
     """A mapping from names, which no section defines, to values.
 
-    It is never changed, so that settings are hashable.
+    A `ByName` is never changed, so that settings are hashable.
     """
 
     def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

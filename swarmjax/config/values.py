@@ -110,7 +110,7 @@ def check_text(key: str, text: str) -> None:
       text: a path or a name, or several of them separated by commas.
 
     Raises:
-      ConfigError: if the text is no valid Unicode, or has a control character or too long a name.
+      ConfigError: if the text is not valid Unicode, or has a control character or too long a name.
     """
     # "Cc" are control characters. "Cs" are halves of letters, which UTF-8 cannot hold.
     if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in text):

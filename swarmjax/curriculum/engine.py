@@ -1,7 +1,8 @@
 """The protocol of a curriculum, and how success is measured for every curriculum.
 
-A curriculum chooses the stages of the next episodes, and observes how episodes ended. Both are pure
-functions of the curriculum's own state, and run on the device. `stages.py` has the built-in modes.
+A curriculum chooses the stages of the next episodes, and observes how episodes ended. Choosing and
+observing are pure functions of the curriculum's own state, and run on the device. `stages.py` has
+the built-in modes.
 
 Success is measured on each stage, without favouring short episodes. A cohort holds all episodes
 that began within a period as long as the step limit of an episode. The verdict on a cohort comes
@@ -29,7 +30,7 @@ from swarmjax.task.stage import Stage
 
 STAYED, BY_THRESHOLD, BY_BUDGET, REWEIGHED = range(4)
 REASONS = ("stayed", "threshold", "budget", "reweighed")
-NEVER = np.iinfo(np.int32).max  # deadline of a stage that has none
+NEVER = np.iinfo(np.int32).max  # stands for no deadline
 # Cohort number of an episode that does not count. Cohorts have numbers from 0, and -1 is the cohort
 # before the first.
 UNCOUNTED = -2
@@ -46,7 +47,7 @@ Success = Literal["targets", "all"]
 
 
 class Schedule(NamedTuple):
-    """The curriculum's numbers: an argument of the compiled program, not constants in it.
+    """The curriculum's stages, deadlines and thresholds: an argument of the compiled program.
 
     Attributes:
       stages: [S], in order.
@@ -203,7 +204,7 @@ class CurriculumState:
     Attributes:
       own: the curriculum's own state, as `Curriculum.init` makes it.
       cohorts: the two newest cohorts, and the record of all stages.
-      met: [] most robots of any stage that was trained so far, int32.
+      met: [] largest number of robots of the stages trained so far, int32.
     """
 
     own: Any
@@ -221,7 +222,7 @@ def init(curriculum: Curriculum, schedule: Schedule) -> CurriculumState:
 
     Args:
       curriculum: the curriculum.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
 
     Returns:
       The state before the first update.
@@ -245,7 +246,7 @@ def observe(
 
     Args:
       curriculum: the curriculum.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       success: the measure of success by which the curriculum decides.
       state: the state before these episodes are counted.
       ended: [T, A] episodes that ended, of this device.
@@ -279,7 +280,7 @@ def init_cohorts(stages: int) -> Cohorts:
 
 
 def no_verdict(stages: int) -> CohortVerdict:
-    """Returns what is known of S stages before the first update."""
+    """Returns the verdict on S stages before the first update, which is empty."""
     record = init_cohorts(stages).record
     return CohortVerdict(jnp.array(True), jnp.zeros(stages, bool), record.success, record)
 

@@ -64,7 +64,7 @@ def make(
     """Makes the curriculum that the settings select.
 
     Args:
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       options: settings of the curriculum.
       own: curricula of an extension.
     """
@@ -106,9 +106,9 @@ def assign(weights: Array, turn: Array, arenas: int) -> Array:
     The weights divide a line into stages. Arena a is at the point (a + u) / A of this line,
     with u within 0..1. So a stage's weight is its share of the arenas, and also its share of time.
     From cohort to cohort, u moves by the golden ratio. If there are few arenas, each arena visits
-    every stage over time. If there are many arenas, most of them stay on their stage. That matters
-    because an arena that moves must wait until its episode ends. If all arenas moved, stages with
-    long episodes would get more than their share.
+    every stage over time. If there are many arenas, most of them stay on their stage. Few arenas
+    should move, because an arena that moves must wait until its episode ends. If all arenas moved,
+    stages with long episodes would get more than their share.
 
     Args:
       weights: [S] share of the arenas on each stage.
@@ -142,7 +142,7 @@ def promoting(
 
     Args:
       state: state of the mode.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       options: settings of the curriculum.
       verdict: what the cohorts show after the update.
       update: [] number of the finished update, from 0; -1 before the first.

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _targets(settings: ExportConfig, trained: TrainConfig) -> dict[int, Path]:
-    """Returns the path of the export for each seed to export."""
+    """Returns the path to write, for each seed to export."""
     every, seed = trained.numbers, settings.seed
     if seed is not None and seed not in every:
         several = f"seeds {every[0]} to {every[-1]}: give one of them."

@@ -1,8 +1,8 @@
 """Drives a Webots e-puck to its target with a trained policy. Needs only NumPy.
 
 In every control step the controller reads infrared, GPS and compass, and sets the speeds of the
-wheels. It needs `policy.npz` and `sensors.json` in the same folder. `sensors.json` says which
-distances the counts of the infrared sensors stand for.
+wheels. The controller needs `policy.npz` and `sensors.json` in the same folder. `sensors.json` says
+which distances the counts of the infrared sensors stand for.
 
 Give the target as `target=x,y` (m) in the robot's controllerArgs, or in its customData, which you
 may change while the robot drives. A policy that is not shared also needs `robot=i`, the robot's

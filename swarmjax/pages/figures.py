@@ -17,7 +17,7 @@ _COLOURS = 128
 def png(figure: Figure, dots: int = DOTS) -> bytes:
     """Makes a PNG file of a figure: the same file in any Matplotlib version.
 
-    A palette makes the file a quarter as large. This matters in a report with a curve for each of
+    A palette makes the file a quarter as large, which helps in a report with a curve for each of
     fifty seeds.
     """
     drawn, content = io.BytesIO(), io.BytesIO()

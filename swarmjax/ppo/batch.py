@@ -145,7 +145,7 @@ def generalized_advantages(
     discount: float,
     gae_lambda: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes advantages and returns of a rollout, time first.
+    """Computes advantages and returns of a rollout; time is the first axis.
 
     Schulman et al. 2016, "High-Dimensional Continuous Control Using Generalized Advantage
     Estimation", equation 16. The sum is cut at the end of each episode and of the rollout. Values

@@ -17,9 +17,8 @@ _LEAST_GENERATION = 8
 # Values of `jax.default_matmul_precision` with which matrix products avoid tensor cores.
 _FULL = ("highest", "float32", "F32_F32_F32")
 
-# autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block.
-# fused: GPU kernels. sequences: autodiff of a policy with memory, without the sequences of absent
-# robots.
+# autodiff: plain autodiff in `ppo.py`. blocks: autodiff of a whole batch, block by block. fused:
+# GPU kernels. sequences: autodiff of a policy with memory, which leaves out absent robots.
 Backend = Literal["autodiff", "blocks", "fused", "sequences"]
 Learn = Callable[[Learning, Progress, Batch, jax.Array], tuple[Progress, Metrics]]
 
@@ -67,7 +66,7 @@ def memory_kernels(config: AlgoConfig) -> Any:
 
 
 def find(backend: Backend) -> Learn:
-    """Returns the function of `ppo/fast/` that learns with a backend other than autodiff."""
+    """Returns the function of `ppo/fast/` that learns with a given backend, except `autodiff`."""
     return importlib.import_module(f"swarmjax.ppo.fast.{backend}").learn
 
 

@@ -10,8 +10,8 @@ def scheduled_stds(config: AlgoConfig) -> tuple[float, ...]:
     """Lists the standard deviations of the schedule, from `initial_std` to the last one.
 
     Each deviation is the previous one minus `std_decrement`, rounded to four digits. If the result
-    is not above `std_floor`, the deviation is `std_floor`, and the list ends. This is
-    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8).
+    is not above `std_floor`, the deviation is `std_floor`, and the list ends.
+    `PPO.decay_action_std` of PPO-PyTorch (nikhilbarhate99, commit 728cce8) does the same.
 
     Args:
       config: Settings with `exploration=scheduled`.

@@ -56,15 +56,15 @@ def ppo_loss(
 ) -> tuple[jax.Array, Metrics]:
     """Computes the loss to minimise.
 
-    It is policy + value_cost * value - entropy_cost * entropy + BOUND_COST * bound. If the critic
-    sees the state, GUESS_COST * guess is added.
+    The loss is policy + value_cost * value - entropy_cost * entropy + BOUND_COST * bound. If the
+    critic sees the state, GUESS_COST * guess is added.
 
     The policy term is the clipped surrogate of Schulman et al. 2017, "Proximal Policy Optimization
     Algorithms", equation 7, negated.
 
-    The value term is half the squared error against the return. This term is not clipped, because
-    clipping hurts (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement Learning?",
-    section 3.4).
+    The value term is half the squared error against the return. The value term is not clipped,
+    because clipping hurts (Andrychowicz et al. 2021, "What Matters in On-Policy Reinforcement
+    Learning?", section 3.4).
 
     The bound term is the squared distance of the mean action from -1..1, summed over the action.
     This term follows `bounds_loss` of rl_games, where the range ends at 1.1. If the mean lies
@@ -138,7 +138,7 @@ def _terms(
 
 
 def evaluate(params: Params, networks: Networks, minibatch: Batch) -> tuple[Acted, jax.Array]:
-    """Runs actor and critic on samples, with a memory step by step; returns both outputs."""
+    """Runs actor and critic on samples, step by step if there is a memory; returns both outputs."""
     seen, state, memory = minibatch.observation, minibatch.state, minibatch.memory
     begins = minibatch.begins
     if begins is not None:

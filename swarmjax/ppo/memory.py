@@ -132,7 +132,7 @@ def remember_all(
 ) -> jax.Array:
     """Computes the memory after each observation of sequences.
 
-    Its gradient is built from the gradient of `remember`. Only terms that depend on the next step
+    The gradient is built from the gradient of `remember`. Only terms that depend on the next step
     are computed step by step. Autodiff would also sum the gradient of `kernel` step by step, from
     products that are too small to fill a GPU.
 

@@ -60,8 +60,9 @@ class Sizes(NamedTuple):
 class Normalizer:
     """Mean and variance of the observations seen so far.
 
-    It replaces Brax's `running_statistics`, which loads MuJoCo, MJX and Warp, and divides 0 by 0 if
-    the first batch has no valid sample. That happens to a learner whose robots are still absent.
+    This class replaces Brax's `running_statistics`, which loads MuJoCo, MJX and Warp, and divides 0
+    by 0 if the first batch has no valid sample. A learner whose robots are still absent has such a
+    batch.
 
     Attributes:
       count: [], float32, number of observations. Beyond 2**24 it is rounded. This is harmless,
@@ -246,7 +247,7 @@ class _Actor(_Network):
     exploration is scheduled.
 
     If the critic sees a state, the actor also guesses it (`guess`). The guess is not used for
-    acting. Its error trains the memory to hold what a robot can know about its surroundings
+    acting. The guess's error trains the memory to hold what a robot can know about its surroundings
     (Mirowski et al. 2017, "Learning to Navigate in Complex Environments", section 3).
 
     Observations are [B, O], or [T, B, O] for sequences of T steps. The memory before the first

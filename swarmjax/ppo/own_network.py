@@ -40,7 +40,7 @@ def _check(torso: Any, name: str, observation_size: int) -> None:
         found, variables = jax.eval_shape(made.init_with_output, jax.random.key(0), seen)
     other = sorted(set(variables) - {"params"})
     if other:
-        raise ConfigError(f"{where} has {', '.join(other)}: a network may have only params.")
+        raise ConfigError(f"{where} has {', '.join(other)}: give a network that has only params.")
     shape = getattr(found, "shape", ())
     if len(shape) != 2 or shape[0] != 3 or found.dtype != jnp.float32:
         kind = getattr(found, "dtype", type(found).__name__)

@@ -56,7 +56,7 @@ def replay(
     if settings.worst is None:
         picks = [Pick(0, row) for row in range(count)]
     elif settings.worst > count:
-        raise ConfigError(f"worst is {settings.worst} of {count} levels: give 1 to {count}.")
+        raise ConfigError(f"worst is {settings.worst}: give 1 to {count} levels.")
     else:
         picks = worst(_judge(settings, entrants[0], suite, count, progress), settings.worst)
     return _record(settings, entrants, suite, picks)

@@ -73,10 +73,10 @@ class Recording(Frames):
 
     Attributes:
       scene: The parts that do not move.
-      reward: [N, R] weighted reward, by term, of the control step that led to the frame. It is 0
-        at the start and, with `task.arrival=latch`, after the robot's arrival.
+      reward: [N, R] weighted reward, by term, of the control step that led to the frame. The reward
+        is 0 at the start and, with `task.arrival=latch`, after the robot's arrival.
       arrival: [R] control steps until the robot arrived, or 0 if it never arrived. With
-        `task.arrival=hold`, control steps until the robot was within its target to stay.
+        `task.arrival=hold`, control steps until the robot reached its target for good.
     """
 
     scene: ReplayScene
@@ -145,7 +145,7 @@ def record(judge: Judge, levels: Sequence[Level]) -> list[Recording]:
 
 
 def _look(judge: Judge, arenas: Arenas) -> dict[str, np.ndarray]:
-    """Takes a frame of all arenas: the fields of `Frames` without the axis N."""
+    """Records one frame of all arenas: the fields of `Frames` without the axis N."""
     sight = engine_c.look(
         judge, arenas.data, arenas.factors, arenas.pose, arenas.target, arenas.obstacle
     )
@@ -216,7 +216,7 @@ def _measure_paths(level: Level, pose: np.ndarray, hull_radius: float) -> np.nda
 def _since(arrived: np.ndarray) -> np.ndarray:
     """Finds for each robot [R] the row of `arrived` [N, R] from which on all rows are True.
 
-    It is 0 for a robot that has not arrived in the last row.
+    The result is 0 for a robot that has not arrived in the last row.
     """
     away = len(arrived) - 1 - np.argmin(arrived[::-1], axis=0)  # the last row outside the target
     return np.where(arrived[-1], away + 1, 0)

@@ -54,7 +54,7 @@ def write(run: Path, out: Path, made_by: str) -> list[Path]:
 
 
 def compare(runs: Sequence[Path], out: Path) -> None:
-    """Prints the table of runs, and writes the picture of the stages that they share.
+    """Prints the table of runs, and draws their success on the stages that they share.
 
     Args:
       runs: run directories.

@@ -42,7 +42,7 @@ def png_files(history: History) -> dict[str, bytes]:
     """
     several = {"stages": stages, "mix": mix} if len(history.names) > 1 else {}
     figures = {name: make(history) for name, make in (several | {"curves": curves}).items()}
-    files = {"success": drawing.png(success(history), 2 * drawing.DOTS)}  # shown large
+    files = {"success": drawing.png(success(history), 2 * drawing.DOTS)}  # the page shows it large
     return files | {name: drawing.png(each) for name, each in figures.items() if each is not None}
 
 
@@ -50,7 +50,7 @@ def mix(history: History) -> Figure:
     """Draws each stage's share of the arenas, stacked, as the mean over seeds."""
     steps, bands = _stretched(history.arena_steps, history.mix.mean(axis=0).T)
     figure, [panel] = over_training(steps[-1], [""])
-    # The mix of an update holds from the end of the update before it.
+    # An update's shares hold from the end of the previous update.
     panel.stackplot(
         np.concatenate([[0], steps]),
         np.concatenate([bands[:, :1], bands], axis=1),
@@ -150,7 +150,7 @@ def over_training(
 
 
 def colours(count: int) -> np.ndarray:
-    """Returns colours [count, 4] for stages or runs. None is too light to be seen on white."""
+    """Returns colours [count, 4] for stages or runs, all dark enough to be seen on white."""
     return colormaps["viridis"](np.linspace(0.0, 0.85, count))
 
 

@@ -99,7 +99,7 @@ class History:
 
     @property
     def labels(self) -> list[str]:
-        """Names of the stages in figures; with `curriculum.axes`, each stage's values of these."""
+        """Names of the stages in figures; with `curriculum.axes`, their values on the axes."""
         axes, stages = self.config.curriculum.axes, self.config.stage
         values = [[words.setting(getattr(stage, key)) for key in axes] for stage in stages]
         return list(map(" · ".join, values)) if axes else self.names
@@ -108,7 +108,7 @@ class History:
     def success(self) -> np.ndarray:
         """The success [N, T, S] by which the curriculum decides.
 
-        It is the share of targets that were reached, or the share of episodes in which all robots
+        Success is the share of targets that were reached, or of episodes in which all robots
         arrived.
         """
         return self.by_stage[self.decided_by]
@@ -163,9 +163,9 @@ def read(run: Path) -> History:
 def _read_metrics(run: Path, stages: int) -> dict[int, dict[int, Row]]:
     """Reads the values that a report needs from each row, by seed and update.
 
-    They become arrays, which need less memory than lists. `lists` [K, S] has the values of the K
-    keys in `_LISTS`. `curves` has those of `CURVES` and of the goal's first own measure, which
-    `names` lists. nan stands for null.
+    The values become arrays, which need less memory than lists. `lists` [K, S] has the values of
+    the K keys in `_LISTS`. `curves` has those of `CURVES` and of the goal's first own measure,
+    which `names` lists. nan stands for null.
     """
     by_seed: dict[int, dict[int, Row]] = {}
     for where, row in read_lines(run, METRICS):
@@ -196,7 +196,7 @@ def measure(history: History) -> str:
 
 
 def together(values: np.ndarray) -> np.ndarray:
-    """Takes the interquartile mean over seeds at the points where every seed has a value.
+    """Computes the interquartile mean over seeds at the points where every seed has a value.
 
     Where only some seeds have a value, these are the fast seeds, whose mean would be biased.
 
@@ -211,7 +211,7 @@ def together(values: np.ndarray) -> np.ndarray:
 
 
 def among(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Takes the interquartile mean [S] over the seeds that have a value, and counts these seeds.
+    """Computes the interquartile mean [S] over the seeds that have a value, and counts them.
 
     Args:
       values: [N, S] with nan for a missing value.

@@ -36,10 +36,11 @@ class TableLine(NamedTuple):
       runs: their directories.
       settings: the settings that differ from the other lines, as `key=value` words.
       stage: name of the last stage.
-      updates: updates that all of the runs have done.
-      budget: updates that they are to do.
+      updates: number of updates that each run has done at least.
+      budget: number of updates that each run is to do.
       seeds: increasing.
-      success: of each seed on the last stage in its newest cohort, 0 to 1; None if there is none.
+      success: success of each seed on the last stage, in the newest cohort, 0 to 1; None without
+        one.
       measure: names the quantity in `success`.
       mean: mean success over the seeds that have one; None where no seed has one.
       interval: ends of the mean's 95 % interval over seeds; None for fewer than three seeds.
@@ -170,9 +171,10 @@ def join(group: Sequence[tuple[Path, History]], settings: str) -> TableLine:
 
 
 def _differences(mine: Mapping[str, Any], every: Sequence[Mapping[str, Any]]) -> str:
-    """Writes the settings that differ between lines, without settings that follow from others.
+    """Writes the settings that differ between lines, except those that follow from other settings.
 
-    Stages of one name are compared setting by setting. An own piece is written without its digest.
+    Stages of one name are compared setting by setting. An extension's piece is written without its
+    digest.
     """
     derived, written = keys(TrainConfig, derived=True).keys() - {"stage_name"}, []
     for key, value in mine.items():

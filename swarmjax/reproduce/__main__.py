@@ -103,7 +103,7 @@ def _write(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _judge(out: Path, given: ReproduceConfig) -> None:
-    """Judges the policies that have not been judged yet."""
+    """Evaluates the policies that have not been evaluated yet."""
     rows = reproduce_rows.read_rows(out)
     known = {(row["arm"], row["seed"], row["stage"], row["action"]) for row in rows}
     done = reproduce_rows.summaries(out)

@@ -3,11 +3,11 @@
 The criteria that support or contradict a claim were fixed before any data existed;
 `templates/claims.yaml` states them. A claim has one reading for each way to understand the paper
 (docs/paper.md). The first reading is the primary reading, which was named before the data of fifty
-seeds existed. It alone decides; the report shows the other readings beside it. Every number is an
-interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced if its primary
-reading holds, and not reproduced if the data contradict the primary reading. It is undecidable if
-the interval straddles the limit or an arm is missing. A reproduction with less than the paper's
-budget gives no verdicts.
+seeds existed. The primary reading alone decides; the report also shows the other readings. Every
+number is an interquartile mean over seeds with its 95 % bootstrap interval. A claim is reproduced
+if its primary reading holds, and not reproduced if the data contradict the primary reading. The
+claim is undecidable if the interval straddles the limit or an arm is missing. A reproduction with
+less than the paper's budget gives no verdicts.
 """
 
 from collections.abc import Callable, Iterable
@@ -70,7 +70,7 @@ class Claim(NamedTuple):
     Attributes:
       name: key of the claim in `claims.yaml`.
       quote: the paper's sentence, word for word.
-      where: the section of the paper that says it.
+      where: the section of the paper that makes the claim.
       criterion: what supports the claim, and what contradicts the claim.
       figures: figures and tables of the report that show whether the claim holds.
       readings: the readings; the first one, the primary reading, decides.
@@ -133,7 +133,7 @@ def _final_and_late(key: str, of: Measure) -> list[Source]:
 
 
 def _named(what: str, sources: Iterable[Source]) -> list[Source]:
-    """Puts the name of the quantity before the names of its sources."""
+    """Puts the name of the quantity in front of each source's name."""
     return [(f"{what}, {name}", values) for name, values in sources]
 
 
@@ -145,7 +145,7 @@ def _readings(
 
 
 def steady(stage: str | None, axis: Axis) -> list[tuple[str, str, Values]]:
-    """Lists the ways to find the step from which success is steady, one per definition of it.
+    """Lists the ways to find when success becomes steady, one per definition of success.
 
     Args:
       stage: uses only the episodes of this stage; None for all.
@@ -187,8 +187,9 @@ def _rewarded() -> list[Source]:
 def _expanded(test: Criterion, which: slice) -> tuple[Reading, ...]:
     """Makes the readings for the 1.5 m arena.
 
-    The arms that continued their training in this arena come first, because Figure 9 shows episodes
-    and "converge" speaks of training. The arms that never trained there (zero-shot) come second.
+    The arms that continued their training in this arena come first, because Figure 9 shows
+    episodes, and the paper's word "converge" is about training. The arms that never trained there
+    (zero-shot) come second.
     """
     values = partial(measures.judged, key="targets_reached", stage=EXPANDED)
     by_mean = partial(values, action="mean")

@@ -54,8 +54,8 @@ def opposite(criterion: Criterion) -> Criterion:
 def higher(ours: np.ndarray, theirs: np.ndarray, *, unit: Unit) -> tuple[bool | None, str]:
     """Tests whether the first arm has higher values than the second.
 
-    The claim holds if the interval of the paired difference lies above 0. It is contradicted if the
-    interval lies below 0.
+    The claim holds if the interval of the paired difference lies above 0. The claim is contradicted
+    if the interval lies below 0.
     """
     more = statistics.paired(theirs[:, None], ours[:, None], iqm)
     both = " against ".join(unit.value(float(iqm(each))) for each in (ours, theirs))
@@ -68,7 +68,7 @@ def earlier(ours: np.ndarray, theirs: np.ndarray) -> tuple[bool | None, str]:
     """Tests whether the first arm reaches a goal earlier; inf stands for never.
 
     The test estimates the probability that a seed of the first arm is earlier than a seed of the
-    second arm. The claim holds if the interval of this probability lies above 0.5. It is
+    second arm. The claim holds if the interval of this probability lies above 0.5. The claim is
     contradicted if the interval lies below 0.5.
     """
     chance = statistics.probability_of_improvement(theirs[:, None], ours[:, None])
@@ -81,8 +81,8 @@ def crowded(values: np.ndarray) -> tuple[bool | None, str]:
     """Tests for crowding, from the results of `measures.crowding`.
 
     Crowding is contradicted if the last robot to arrive has no more steps with something in range
-    than the first robot. If it has more, crowding is possible but not proven, so the reading stays
-    open.
+    than the first robot. If the last robot has more, crowding is possible but not proven, so the
+    reading stays open.
     """
     mean = statistics.bootstrap(values[:, None], iqm)
     text = f"{NUMBER.difference(mean)} steps"

@@ -40,7 +40,7 @@ def targets(log: RunLog) -> np.ndarray:
 
 
 def first_reward(log: RunLog) -> np.ndarray:
-    """Takes the cumulative reward [E] of robot 1, m. The paper's Figure 7 is "for one robot"."""
+    """Returns the cumulative reward [E] of robot 1, m. The paper's Figure 7 is "for one robot"."""
     return log.reward[:, 0]
 
 
@@ -92,9 +92,10 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
 def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> int | None:
     """Finds where success becomes steady.
 
-    This is the first episode that meets three conditions. In the window that starts with this
-    episode, at least `share` of the episodes succeed. The same holds for all episodes from this one
-    to the end of the run, taken together. In no later window do fewer than `KEPT` of them succeed.
+    Success is steady from the first episode that meets three conditions. In the window that starts
+    with this episode, at least `share` of the episodes succeed. The same holds for all episodes
+    from this one to the end of the run, taken together. In no later window do fewer than `KEPT` of
+    them succeed.
 
     Later windows need not reach `share`, because such a rule would measure the length of the run: a
     policy that succeeds in nine of ten episodes has fewer than 16 successes in one of 23 windows,
@@ -106,7 +107,7 @@ def steady(success: np.ndarray, window: int = WINDOW, share: float = STEADY) -> 
       share: share of successes that a window must have.
 
     Returns:
-      Index of the episode; None if there is none.
+      Index of that episode; None if success never becomes steady.
     """
     # Compares counts, since 16 / 20 must equal 0.8; the small number absorbs rounding.
     counts = rolling(success.astype(float), window) * window

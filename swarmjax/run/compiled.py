@@ -42,7 +42,7 @@ def compile_chunk(
 
     Args:
       program: the run's program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       state: states with a seed axis [N], or their shapes from `jax.eval_shape`.
       keep_trace: whether to keep the traced program for later runs, and to use one that was kept.
 

@@ -1,10 +1,10 @@
 """Writes a run directory: one process at a time, complete files, and append-only logs.
 
-- A lock keeps a second process out. It is released when the process that holds it dies.
+- A lock keeps a second process out. The lock is released when the process that holds it dies.
 - `config.json` and `summary.json` are replaced completely or not at all.
-- Logs are files of JSON lines. Each checkpoint records their lengths in bytes. A resumed run first
-  truncates the logs to those lengths, in one step, and then appends.
-- Each run has an id. Its checkpoints store the id and a digest of the config's fixed keys.
+- Logs are files of JSON lines. Each checkpoint records the logs' lengths in bytes. A resumed run
+  first truncates the logs to those lengths, in one step, and then appends.
+- Each run has an id. The run's checkpoints store the id and a digest of the config's fixed keys.
 """
 
 import contextlib

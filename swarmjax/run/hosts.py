@@ -33,7 +33,7 @@ _OWN = {"run.id": None}
 def join(settings: TrainConfig) -> None:
     """Joins the other processes of a run, if `run.distributed` is true.
 
-    JAX finds the other processes as `jax.distributed.initialize` says. JAX reads
+    `jax.distributed.initialize` documents how JAX finds the other processes. JAX reads
     `JAX_COORDINATOR_ADDRESS` itself, but not `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID`, which are
     needed without a cluster's scheduler.
 

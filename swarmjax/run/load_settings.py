@@ -73,7 +73,7 @@ def load_train(
     """Makes the configuration of `swarmjax.train` from its `key=value` words.
 
     Args:
-      overrides: the words.
+      overrides: the `key=value` words.
       stages: plain data of the stages; None if the words name the stages.
 
     Raises:

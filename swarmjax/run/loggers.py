@@ -1,7 +1,7 @@
 """Sends a run's metrics to loggers: TensorBoard, W&B and your own.
 
-`metrics.jsonl` is the run's own record. This file is written first, checkpoints record its length,
-and a run that cannot write this file ends. A logger holds nothing beyond this record, so a failure
+`metrics.jsonl` is the run's own record. `metrics.jsonl` is written first, checkpoints record its
+length, and a run that cannot write it ends. A logger holds nothing beyond this record, so a failure
 of a logger does not end the run.
 """
 

@@ -36,8 +36,8 @@ def rows(
 
     Returns:
       Rows of plain numbers, ordered by update, then by seed. Counts are unchanged. Shares and means
-      are taken over the episodes that ended on the row's stage in the update. They are None if no
-      episode ended.
+      cover the episodes that ended on the row's stage in the update. They are None if no episode
+      ended.
     """
     # The axes [n, N] are flattened in this order, so that the seeds of an update are adjacent.
     columns = {

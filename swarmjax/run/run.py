@@ -89,7 +89,7 @@ class Run:
           settings: the config.
           stop: notices signals; None: the run cannot be stopped.
           display: shows the run; None: nothing is shown.
-          loggers: receive the rows, beside the loggers that the config names.
+          loggers: receive the rows, in addition to the loggers that the config names.
           on_update: called with a copy of each row; it returns True to stop the run.
           keep_traces: whether to keep traced programs for later runs. Only for a new process: its
             code is that of the files, and their digest is the key.
@@ -386,7 +386,7 @@ class Run:
         self._saved = (time.monotonic(), self.update)
 
     def _write_results(self) -> None:
-        """Writes the policies and the summary, and says how good the swarm is and what to do."""
+        """Writes the policies and the summary; says how good the swarm is and what to do next."""
         leaves = checkpoint.to_leaves(hosts.gather(self.state))
         results.write_policies(self.path, self.settings, leaves, self.update)
         compile_s = self.compiled.seconds if self.update > self._first else 0.0

@@ -1,4 +1,4 @@
-"""What a run says: what it trains, how it is going, how good the swarm is, and what comes next."""
+"""What a run prints: what it trains, its progress, how good the swarm is, what to do next."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from swarmjax.training.rollout import Program
 def first(
     settings: TrainConfig, run: Path, kept: Kept | None, source: Kept | None
 ) -> Iterator[str]:
-    """Describes what is trained on what and into which folder, and what the run starts from."""
+    """Describes the stages, updates, seeds, device and folder of a run, and what it starts from."""
     names, title, seeds = settings.stage_names, settings.stage_name, settings.numbers
     stages = words.shorten(title, 40) + (f" {names[0]} to {names[-1]}" if len(names) > 1 else "")
     several = f" of seeds {seeds[0]} to {seeds[-1]}" if settings.seeds > 1 else ""
@@ -60,7 +60,7 @@ def nothing_left(settings: TrainConfig, update: int) -> str:
 
 
 def promotions(settings: TrainConfig, decisions: Iterable[Row]) -> Iterator[str]:
-    """Describes each change of stage. The other decisions are many and only go to the log."""
+    """Describes each change of stage. All other decisions are only in the log."""
     for entry in decisions:
         if "to" in entry:
             seed = f"seed {entry['seed']}, " if settings.seeds > 1 else ""
@@ -96,7 +96,7 @@ def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     episodes = min(row["episodes_by_stage"][-1] for row in measured)
     return (
         f"{said} within {steps} control steps ({seconds:.3g} s), over "
-        f"{words.count(episodes, 'episode')} begun together"
+        f"{words.count(episodes, 'episode')}"
     )
 
 

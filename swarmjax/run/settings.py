@@ -13,7 +13,7 @@ from swarmjax.training.config import ProgramConfig
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig(Section):
-    """Where a run is written, and how often."""
+    """Where a run is written, how often, and when it stops."""
 
     id: str | None = setting(None, "random id, drawn when the run begins", derived=True)
     dir: str | None = setting(None, "run directory; null: runs/<date>-<time>-<stage>-seed<seed>")

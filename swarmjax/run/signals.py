@@ -1,9 +1,9 @@
 """Handles signals: at the first signal a run saves and stops, at the second it stops at once.
 
 SIGINT comes from a person and ends the run with code 130. SIGTERM, SIGUSR1, SIGUSR2 and SIGHUP come
-from a scheduler or a lost terminal. They end the run with code 75, so that a job script can requeue
-it. A signal that is ignored when the command starts stays ignored. This module imports nothing
-slow, so a command can listen before it loads JAX.
+from a scheduler or a lost terminal. These four signals end the run with code 75, so that a job
+script can requeue it. A signal that is ignored when the command starts stays ignored. This module
+imports nothing slow, so a command can listen before it loads JAX.
 """
 
 import math

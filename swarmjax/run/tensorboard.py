@@ -81,7 +81,7 @@ class Boards:
 
 
 def numbers(row: Row, stages: Sequence[str] = ()) -> dict[str, float]:
-    """Lists the numbers of a row by name; leaves out what is no number.
+    """Lists the numbers of a row by name; leaves out all other values.
 
     Args:
       row: a row of `metrics.jsonl`. A list in the row has one number for each stage. The name of

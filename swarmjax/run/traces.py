@@ -77,10 +77,10 @@ def keep(
 
 
 def _can_keep(program: Program[TrainConfig]) -> bool:
-    """Returns whether the key covers the whole trace, and the trace is all that a call needs."""
+    """Returns whether the key covers all of the trace, and a call needs only the trace."""
     config, engine = program.config, program.world.physics.engine
-    # Tracing also registers the kernels of Warp, of which only those for planar robots can be
-    # registered again. An extension may import any file, which the key would not cover.
+    # Tracing also registers Warp's kernels. Only those for planar robots can be registered again.
+    # An extension may import any file, and the key does not cover these files.
     again = engine.impl == "jax" or (engine.solver, config.robot.body) == ("swarm", "planar")
     return again and config.devices == 1 and config.extensions is None
 

@@ -144,8 +144,8 @@ def scale_mass(ratio: Array, rows: Rows, model: mujoco.MjModel) -> Changes:
     Returns:
       The changed rows of the bodies and degrees of freedom. They include MuJoCo's inverse weights,
       which set how soft contacts are and which MJX does not recompute. The inverse weights are
-      divided by `ratio`. This is exact except for the part of the weights that stems from the wheel
-      motors.
+      divided by `ratio`. The division is exact except for the part of the weights that stems from
+      the wheel motors.
     """
     bodies, dofs = rows.bodies, rows.dofs
     return {

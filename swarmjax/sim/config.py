@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim import sensors
 
 # m; wider hulls make wider passages (`passage` in task/stage_config.py). A passage for this hull is
-# 0.41 m wide, a tenth of the largest arena's side.
+# 0.41 m wide, a tenth of the side of a 4 m arena.
 LARGEST_HULL = 0.15
 _HULL_REASON = (
     "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
@@ -128,7 +128,7 @@ class RobotConfig(Section):
 
     @property
     def wheel_inertia(self) -> list[float]:
-        """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the wheel's mass.
+        """Moments of inertia of a wheel, kg m^2: those of the e-puck's wheel, scaled by the mass.
 
         The values do not depend on the radius. About the axle, the motor's inertia is far larger
         than the wheel's. About the upright axis, the body makes up the rest of `yaw_inertia`.

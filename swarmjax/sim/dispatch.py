@@ -60,7 +60,7 @@ def resolve_impl(impl: str) -> str:
     installed = importlib.util.find_spec("warp") is not None
     if impl == "warp" and not installed:
         raise ConfigError(
-            "sim.impl is warp, but Warp is not installed: install extra gpu, or give sim.impl=jax."
+            "sim.impl is warp, but Warp is not installed: add the extra gpu, or give sim.impl=jax."
         )
     if impl != "auto":
         return impl

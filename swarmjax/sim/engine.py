@@ -13,8 +13,8 @@ from jax import Array
 
 # Warp stores the pairs of geoms that may touch, for all arenas together. It compares spheres around
 # geoms, and the sphere around a wall contains all robots. So for each robot, Warp gets memory for
-# pairs with all walls and boxes, and with this number of other robots on average. A robot of a
-# swarm is near far fewer others on average.
+# pairs with all walls and boxes, and with this number of other robots on average. On average, a
+# robot of a swarm has far fewer others near it.
 OTHERS_PER_ROBOT = 3
 # Largest number of contacts per robot in one arena. A disc touches at most six discs of its own
 # size at once.

@@ -32,7 +32,7 @@ def gaps(
     Returns:
       [R, 3] m, in the order of `KINDS`; `inf` if there is no object of that kind. With `near`, a
       gap between robots is exact up to the `limit` that `near` was found with; a larger gap is
-      returned as any number above that limit, or as `inf`. This is enough for contacts, whose gaps
+      returned as any number above that limit, or as `inf`. Contacts need no more, since their gaps
       are at most 0.
     """
     x, y = pose[:, :1], pose[:, 1:2]
@@ -54,7 +54,7 @@ def gaps(
 
 
 def _box_distance(x: Array, y: Array, box: Box, xp: Any) -> Array:
-    """Returns signed distances [...] from points to turned rectangles, m."""
+    """Returns signed distances [...] from points to rotated rectangles, m."""
     x, y = to_box_frame(x - box.x, y - box.y, box)
     x, y = xp.abs(x) - box.half_x, xp.abs(y) - box.half_y
     outside = xp.sqrt(xp.maximum(x, 0.0) ** 2 + xp.maximum(y, 0.0) ** 2)

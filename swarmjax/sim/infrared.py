@@ -1,4 +1,4 @@
-"""The infrared rays of robots, computed from the geometry of walls, discs and turned boxes.
+"""The infrared rays of robots, computed from the geometry of walls, discs and rotated boxes.
 
 There is one function per shape. Each function returns the distance at which a ray meets the shape,
 `inf` for a ray that misses it, and 0 for a ray that starts inside it. The e-puck's sensors sit 3.5
@@ -67,7 +67,7 @@ class Ray(NamedTuple):
 
 
 class Box(NamedTuple):
-    """Turned rectangles, with sine and cosine of the yaw computed once for all rays.
+    """Rotated rectangles, with sine and cosine of the yaw computed once for all rays.
 
     Attributes:
       x: [...] x of the centre, m.
@@ -178,7 +178,7 @@ def ray_disc(ray: Ray, x: Array, y: Array, radius: float, xp: Any) -> Array:
 
 
 def ray_box(ray: Ray, box: Box, xp: Any) -> Array:
-    """Returns the distance to a turned rectangle, by the slab method in the rectangle's frame.
+    """Returns the distance to a rotated rectangle, by the slab method in the rectangle's frame.
 
     Args:
       ray: [...].

@@ -1,8 +1,8 @@
 """Builds the MuJoCo model of one arena: robots, obstacles and walls.
 
 Stages differ only in poses and sizes: the arena's side, the obstacles, and which robots and
-obstacles are present. These are set at run time, so the model is compiled only once, for the
-largest case. This module uses MuJoCo only, no JAX.
+obstacles are present. Poses and sizes are set at run time, so the model is compiled only once, for
+the largest case. This module uses MuJoCo only, no JAX.
 """
 
 import copy
@@ -192,7 +192,7 @@ def _rubbing(friction: float) -> dict[str, Any]:
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, body: Body, *, rubs: bool) -> None:
-    """Selects Euler, as servos are discrete; disables unused features, since they cost MJX time."""
+    """Selects Euler's method, as servos are discrete; disables unused features, which cost time."""
     if rubs:
         spec.option.cone = body.cone
     spec.option.timestep = timestep

@@ -26,10 +26,10 @@ _TICKS = {"epuck1": 10_000, "epuck2": 50_000}
 def disturb(wheels: Array, realism: RealismConfig, seed: Array, clock: Array, xp: Any) -> Array:
     """Converts requested wheel speeds to actual ones.
 
-    First the firmware rounds the requested speed. Then grip and load multiply the rounded speed by
-    1 + N(0, sd), drawn for each wheel and control step. The noise comes last because the firmware
-    does not know it, so the result need not be a speed that the firmware can set. ARGoS'
-    `epuck_wheels` has the same factor (sd 0.05 in IRIDIA's experiments).
+    First the firmware rounds the requested speed. Then the rounded speed is multiplied by 1 + N(0,
+    sd), the effect of grip and load, drawn for each wheel and control step. The noise comes last
+    because the firmware does not know it, so the result need not be a speed that the firmware can
+    set. ARGoS' `epuck_wheels` has the same factor (sd 0.05 in IRIDIA's experiments).
 
     Args:
       wheels: [..., R, 2] requested speeds of the left and right wheel, rad/s.

@@ -121,9 +121,9 @@ def normal(seed: Array, clock: Array, stream: int, shape: tuple[int, ...], xp: A
 def _mix(word: Array) -> Array:
     """Scrambles uint32 one to one: flipping any input bit flips each output bit half of the time.
 
-    This is `triple32inc` from Chris Wellons, "Prospecting for Hash Functions" (2018) and the tables
-    of github.com/skeeto/hash-prospector. The tables give it a bias of 0.0208; a perfect hash has a
-    measured bias of 0.021.
+    The function is `triple32inc` from Chris Wellons, "Prospecting for Hash Functions" (2018) and
+    the tables of github.com/skeeto/hash-prospector. The tables give the function a bias of 0.0208;
+    a perfect hash has a measured bias of 0.021.
     """
     word = word + np.uint32(1)
     word = (word ^ (word >> 17)) * np.uint32(0xED5AD4BB)

@@ -70,7 +70,7 @@ class Physics:
 
 
 def build_kernels(physics: Physics, states: PhysicsState) -> None:
-    """Makes Warp build MJX's kernels now, which takes half a minute, not at the first step.
+    """Makes Warp build MJX's kernels now and not at the first step; this takes half a minute.
 
     Args:
       physics: the compiled physics, whose engine has `builds_kernels` true.
@@ -106,7 +106,7 @@ def poses(physics: Physics, data: Data | PhysicsState) -> Array:
 
 
 def is_finite(data: Data) -> Array:
-    """Returns [] whether positions and velocities of the arena are finite."""
+    """Returns whether all positions and velocities of the arena are finite, []."""
     return jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
 
 

@@ -1,4 +1,4 @@
-"""Settings of the sensor models, and of differences between robots and between steps."""
+"""Settings of the sensor models, and of random differences between robots and between steps."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot"
 
 @dataclass(frozen=True, kw_only=True)
 class RealismConfig(Section):
-    """Settings of the sensor models, and of differences between robots and between steps.
+    """Settings of the sensor models, and of random differences between robots and between steps.
 
     A pair of numbers is the range (low, high) of a uniform distribution. A setting that is null
     switches off its own effect only. configs/realism/real.yaml holds the numbers of a real robot,

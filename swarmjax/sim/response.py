@@ -4,11 +4,11 @@ A ray is the horizontal distance from the sensor's origin to the nearest object,
 robot's ray is tilted upwards by `robot.sensor_tilt`, so its length to an upright face is this
 distance divided by cos(tilt).
 
-`webots` is a lookup table; the default is the table of Webots' E-puck. It maps (length of the ray)
-/ reflectance to counts, with multiplicative noise. With the default table, a sensor that sees
-nothing (free space) reads 67.19 counts. `real` has a curve for each sensor, fitted to a measured
-robot. The curve gives reflectance * A / (gap + d)^2 counts, with additive noise; the counts in free
-space are subtracted, as in the firmware. The code runs on NumPy or JAX.
+`webots` is a lookup table; the default is the table of Webots' E-puck. The table maps (length of
+the ray) / reflectance to counts, with multiplicative noise. With the default table, a sensor that
+sees nothing (free space) reads 67.19 counts. `real` has a curve for each sensor, fitted to a
+measured robot. The curve gives reflectance * A / (gap + d)^2 counts, with additive noise; the
+counts in free space are subtracted, as in the firmware. The code runs on NumPy or JAX.
 """
 
 import math
@@ -30,7 +30,7 @@ class Table(NamedTuple):
       length: increasing ray lengths along the tilted ray, m.
       counts: counts at each length, decreasing.
       share: standard deviation of the noise at each length, relative to the counts.
-      rise: ratio of a ray's horizontal length to its length, the cosine of the tilt.
+      rise: cosine of a ray's tilt: its horizontal length divided by its length.
     """
 
     length: tuple[float, ...]
@@ -45,7 +45,7 @@ class Table(NamedTuple):
 
 
 def table(points: Sequence[Sequence[float]], tilt: float) -> Table:
-    """Makes a table from rows of `robot.sensor_response`, for rays that rise by `tilt` rad."""
+    """Makes a table from rows of `robot.sensor_response`, for rays tilted upwards by `tilt` rad."""
     length, counts, share = zip(*points, strict=True)
     return Table(length, counts, share, math.cos(tilt))
 
@@ -106,7 +106,7 @@ def read(
       table: the response `webots`.
 
     Returns:
-      [..., R, K] counts. They are not clamped: noise can make a `real` reading negative.
+      [..., R, K] counts. Counts are not clamped: noise can make a `real` reading negative.
     """
     if wear.dead is not None:
         ray = xp.where(wear.dead, xp.inf, ray)

@@ -49,7 +49,7 @@ class Surround(NamedTuple):
 
 
 def look(scene: Scene, poses: Any, hull_radius: float, limit: float, impl: str = "jax") -> Surround:
-    """Looks around from each robot.
+    """Finds what surrounds each robot.
 
     Args:
       scene: an arena.

@@ -46,7 +46,7 @@ def check_poses(poses: tuple[Pose, ...], hull_radius: float, reach: float) -> No
             raise ConfigError(
                 f"sensor_poses puts sensor {i} at {show(pose)}, {away:.6f} m from the middle, but "
                 f"hull_radius is {show(hull_radius)}: move the sensor to at most "
-                f"{show(hull_radius)} m, rounded towards the middle, or give a larger hull."
+                f"{show(hull_radius)} m (round x and y towards 0), or give a larger hull."
             )
         if abs(pose[2]) > MOST_YAW:
             raise ConfigError(

@@ -157,7 +157,7 @@ def encoders(qpos: Array, xp: Any) -> Array:
 
 
 def _changes(chassis: Chassis, rows: Rows, robot: RobotConfig, model: mujoco.MjModel) -> Changes:
-    """Returns the changes. Larger wheels raise the axle in the body, so skids stay clear."""
+    """Returns a chassis' changes. Larger wheels raise the axle; the skids keep their height."""
     changes: Changes = {}
     if chassis.mass is not None:
         changes |= scale_mass(chassis.mass / robot.mass, rows, model)

@@ -1,4 +1,4 @@
-"""The compiled program of a run: it drives, learns and decides, for a given number of updates.
+"""The compiled program of a run: rollouts, learning and curriculum, for some number of updates.
 
 The package imports `task`, `sim`, `ppo` and `curriculum`. `config.py` has the settings that
 determine the program, and `program.py` builds it. `rollout.py` drives the arenas, `loop.py` joins

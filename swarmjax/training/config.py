@@ -12,7 +12,7 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# By default, each arena gets one waiting episode for every STEPS_PER_EPISODE control steps of a
+# By default, one level is drawn for each arena and every STEPS_PER_EPISODE control steps of a
 # rollout. The shortest episodes of the six stages take 23 steps.
 STEPS_PER_EPISODE = 32
 

@@ -44,9 +44,10 @@ class EpisodeLog(NamedTuple):
 def room(config: ProgramConfig) -> int:
     """Returns how many episodes of one update and seed are kept at most.
 
-    In an update, an arena ends the episode under way and its waiting episodes. If fewer episodes
-    wait than by default, the arena repeats the last one, so it needs as much room as by default. A
-    short step limit ends more episodes. An arena ends at most one episode at each control step.
+    In an update, an arena can end its running episode and all of its waiting episodes. If fewer
+    episodes wait than by default, the arena repeats the last one, so it needs as much room as by
+    default. A short step limit ends more episodes. An arena ends at most one episode at each
+    control step.
     """
     steps, limit = config.algo.rollout_length, config.task.step_limit
     usual = max(config.waiting, steps // STEPS_PER_EPISODE, steps // limit)

@@ -1,7 +1,7 @@
-"""The compiled training loop: rollout, advantages, PPO update, curriculum, n times.
+"""The compiled training loop: rollout, advantages, PPO update and curriculum, repeated n times.
 
-A call trains a chunk of n updates. This number is an argument, so one program serves every chunk
-size. The run is the same with any chunk size.
+A call trains a chunk of n updates. n is an argument, so one program serves every chunk size. The
+run is the same with any chunk size.
 """
 
 from collections.abc import Iterable
@@ -52,7 +52,7 @@ def init(program: Program, schedule: Schedule, seed: Array | None = None) -> Tra
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       seed: [] seed of the run, int32; None for the seed of the config.
 
     Returns:
@@ -74,7 +74,7 @@ def train_chunk(
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       state: state before these updates.
       n: [] number of updates, at most `program.rows`, int32.
 
@@ -99,7 +99,7 @@ def update(program: Program, schedule: Schedule, state: TrainState) -> tuple[Tra
 
     Args:
       program: the compiled program.
-      schedule: the curriculum's numbers.
+      schedule: the curriculum's stages, deadlines and thresholds.
       state: state before this update.
 
     Returns:
@@ -221,7 +221,7 @@ def _learner_metrics(learned: Metrics, batch: Batch, shards: Shards) -> Metrics:
 
 
 def _episode_metrics(ended: Ended, stage: Array, measures: Iterable[str]) -> Metrics:
-    """Sums over the episodes that ended in this update on the current training stage."""
+    """Sums results of the episodes that ended in this update on the current training stage."""
     mine = ended.stage == stage
 
     def total(x: Array) -> Array:

@@ -82,7 +82,7 @@ def init(program: Program) -> Callable[..., TrainState]:
       program: the compiled program.
 
     Returns:
-      A function from the curriculum's numbers and the seeds [N] to the states [N] before the first
+      A function from the curriculum's schedule and the seeds [N] to the states [N] before the first
       update, spread over devices. Called without seeds, it takes the seeds of the config.
     """
     start = partial(seeds.each, partial(loop.init, program))
@@ -175,5 +175,5 @@ def _placed(sharding: NamedSharding, x: jax.Array) -> jax.Array:
 
 
 def _without_empty(state: TrainState) -> TrainState:
-    """Makes arrays without elements anew, because `shard_map` of jaxlib 0.11.2 fails on them."""
+    """Replaces empty arrays by new ones, because `shard_map` of jaxlib 0.11.2 fails on them."""
     return jax.tree.map(lambda x: x if x.size else jnp.zeros(x.shape, x.dtype), state)

@@ -52,14 +52,14 @@ def build[C: ProgramConfig](config: C, world: World, *, by_robot: bool = False) 
 
 
 def load[C: ProgramConfig](config: C, *, by_robot: bool = False) -> tuple[Program[C], Schedule]:
-    """Builds the program and the curriculum's numbers; resolves every setting that is `auto`.
+    """Builds the program and the curriculum's schedule; resolves every setting that is `auto`.
 
     Args:
       config: the settings.
       by_robot: whether to report each episode robot by robot.
 
     Returns:
-      The program, and the curriculum's numbers, which are an argument of the program.
+      The program, and the curriculum's schedule, which is an argument of the program.
 
     Raises:
       ConfigError: Warp is required but not installed, the gradient's backend is not available, or a
@@ -108,7 +108,7 @@ def load_world(config: ProgramConfig) -> World:
 
 
 def schedule(config: ProgramConfig) -> Schedule:
-    """Computes the curriculum's numbers.
+    """Computes the curriculum's stages, deadlines and thresholds.
 
     All stages before the last together get the share `budget_share` of the updates, in equal parts.
     """
@@ -128,7 +128,7 @@ def schedule(config: ProgramConfig) -> Schedule:
 
 
 def groups(config: ProgramConfig, cores: int) -> int:
-    """Returns into how many equal groups the seeds are split; the groups run at the same time.
+    """Returns the number of equal groups of seeds; all groups run at the same time.
 
     Args:
       config: settings of the run.

@@ -38,7 +38,7 @@ class Program[C: ProgramConfig]:
       config: settings of the program.
       world: the compiled environment.
       ppo: how the learners act and learn.
-      curriculum: makes the curriculum with the numbers of a schedule.
+      curriculum: makes the curriculum for a `Schedule`.
       shards: how the arenas are spread over devices.
       by_robot: whether to report each episode robot by robot.
       waiting: episodes that are drawn for each arena before a rollout.
@@ -118,7 +118,7 @@ def draw_starts(
     Args:
       world: the compiled environment.
       stages: [S] stages of the curriculum.
-      stage: [W, A] index of the stage of each arena's first waiting episode, second, and so on.
+      stage: [W, A] index of the stage of each waiting episode, W for each arena.
       cohort: [] number of the cohort for which the episodes count, int32.
       key: random key for the levels, consumed.
       shards: how the arenas are spread over devices; A is the number of arenas on this device.

@@ -1,7 +1,7 @@
 """`python -m swarmjax.watch run=DIR [port=N]`: serves a page on this machine that follows a run.
 
 Prints the page's address, and serves it until Ctrl-C. The page shows whether the run trains, has
-ended or has stopped early. It needs no account, and sends nothing off the machine.
+ended or has stopped early. The page needs no account, and sends nothing off the machine.
 
 Examples:
   # serve a page on this machine, and print its address

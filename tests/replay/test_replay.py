@@ -199,7 +199,7 @@ def test_a_film_that_cannot_be_written_says_why(steer, tmp_path, monkeypatch):
 
 def test_what_a_suite_has_not_is_refused(steer, suite):
     words = [f"policy={steer}", f"suite={suite}"]
-    assert refusal(replay.main, [*words, "worst=6"]) == ("worst is 6 of 5 levels: give 1 to 5.")
+    assert refusal(replay.main, [*words, "worst=6"]) == ("worst is 6: give 1 to 5 levels.")
     assert refusal(load_levels, ReplayConfig, [*words, "level=4"]).endswith(
         ": give worst too, as in worst=5."
     )

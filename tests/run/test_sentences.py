@@ -15,7 +15,7 @@ SETTINGS = load_train(["stage=curriculum", "stage.sequence=[s1,s2]"])
 @pytest.mark.parametrize(
     ("by_seed", "said"),
     [
-        ([[0.9, 0.65]], "65.0 % within 500 control steps (16 s), over 40 episodes begun together"),
+        ([[0.9, 0.65]], "65.0 % within 500 control steps (16 s), over 40 episodes"),
         ([[None, 0.5], [None, 0.7]], "60.0 % (50 to 70) within 500 control steps (16 s)"),
         ([[0.9, None]], "not measured yet: the run was too short on this stage"),
     ],

@@ -27,10 +27,10 @@ ONE = "[[0.03,0,0]]"
     [
         (["robot.sensor_poses=[[0.04,0,0]]"], "robot.sensor_poses puts sensor 0 at [0.04,0,0], "
          "0.040000 m from the middle, but hull_radius is 0.037: move the sensor to at most "
-         "0.037 m, rounded towards the middle, or give a larger hull."),
+         "0.037 m (round x and y towards 0), or give a larger hull."),
         (["robot.hull_radius=0.03"], "robot.sensor_poses puts sensor 0 at "
          "[0.03,-0.01,-0.30081], 0.031623 m from the middle, but hull_radius is 0.03: move the "
-         "sensor to at most 0.03 m, rounded towards the middle, or give a larger hull."),
+         "sensor to at most 0.03 m (round x and y towards 0), or give a larger hull."),
         (["robot.sensor_poses=[[0.03,0,3.14159]]"], "robot.sensor_range is 0.04, but the ray of "
          "sensor 0, [0.03,0,3.14159], runs 0.067 m within its own hull and would see nothing: "
          "give a larger range, or turn or move the sensor outwards."),

@@ -85,7 +85,7 @@ def gradient(
       expected_valid: [], number of valid samples in the whole batch.
 
     Returns:
-      The gradient, and the metrics of the loss; 0 if nothing is valid.
+      The gradient, and the metrics of the loss; 0 if no sample is valid.
     """
 
     def of_block(i: jax.Array | int) -> tuple[Params, Metrics]:

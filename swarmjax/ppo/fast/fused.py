@@ -59,7 +59,7 @@ METRICS = (
     "skipped_steps",
 )
 
-# What the kernel of each network reads of a sample.
+# The parts of a sample that the kernel of each network reads.
 _READ = {
     "actor": ("observation", "action", "log_prob", "advantage", "valid"),
     "critic": ("observation", "return_", "valid"),
@@ -90,7 +90,7 @@ def choose_launch(
       config: Settings of networks that `fits` accepts.
       observation_size: O.
       action_size: U.
-      samples: B of the batch that minibatches are dealt from; None if the batch is one minibatch.
+      samples: B, the samples of a batch that is split into minibatches; None if it is not split.
 
     Returns:
       `LARGE` if the chip has enough memory for it and each minibatch gets at least `_LEAST_TILES`
@@ -319,8 +319,8 @@ def learn(
     of devices as well as on the random streams.
 
     Here each network is one vector, and the optimiser's state for each network is also one vector.
-    Otherwise there would be two dozen small arrays, and most kernels of a minibatch would handle
-    only one of them.
+    With a tree of two dozen small arrays instead, most kernels of a minibatch would handle only one
+    array.
 
     Args:
       learning: Settings and networks that `fits` accepts, and the optimiser.

@@ -130,8 +130,8 @@ def fits(
     """Tells whether the kernel supports a network: its widths, and the memory that it needs.
 
     Triton stores the first weight matrix once and all others twice: the second copy is transposed
-    for the backward pass. It also stores a tile of observations, and two tiles of the widest hidden
-    layer.
+    for the backward pass. Triton also stores a tile of observations, and two tiles of the widest
+    hidden layer.
 
     Args:
       inputs: Width of the observation. The widths of observation and output are padded.
@@ -163,13 +163,13 @@ def sums(
     """Sums the gradient of a loss, and the loss's other terms, over the samples of some tiles.
 
     Args:
-      parameters: [n] of a network. They have no padding in the GPU's memory, and are padded on
-        the chip.
+      parameters: [n] of a network. The parameters have no padding in the GPU's memory, and are
+        padded on the chip.
       layout: Layout of `parameters`. `padded_width` leaves the widths of the hidden layers
         unchanged.
       activation: Activation of the hidden layers, `tanh`, `relu` or `swish`.
-      loss: Loss of the output. Its results must be 0 for samples that are not valid. It gets the
-        layout's vectors with padding, and returns their derivatives under the same names.
+      loss: Loss of the output. All its results must be 0 for samples that are not valid. The loss
+        gets the layout's vectors with padding, and returns their derivatives under the same names.
       samples: By name, each [B] or [B, width], float32. `observation` [B, O] is the network's
         input.
       tiles: The tiles to sum over, each of `launch.tile` samples.

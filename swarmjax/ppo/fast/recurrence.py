@@ -99,7 +99,7 @@ def fits(size: int, shared_memory: int) -> bool:
     """Tells whether the kernels support a memory of this width on this chip.
 
     The chip's memory holds the recurrent weights twice: the second copy is transposed for the
-    backward pass. It also holds four tiles of memories and derivatives.
+    backward pass. The chip also holds four tiles of memories and derivatives.
 
     Args:
       size: H.
@@ -132,7 +132,7 @@ def _stages(size: int, shared_memory: int) -> int:
       shared_memory: Bytes of the chip's memory that a program may use.
 
     Returns:
-      `_STAGES`, or 1 if the inputs of further steps do not fit beside what `fits` counts.
+      `_STAGES`, or 1 if the chip's memory has no room for the inputs of further steps.
     """
     inputs = TILE * size * (3 * 2 + 3 * 4)
     return _STAGES if _bytes(size) + (_STAGES - 1) * inputs <= shared_memory else 1

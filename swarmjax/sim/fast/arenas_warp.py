@@ -51,9 +51,9 @@ def _call(solve: Any, *given: Any) -> Array:
 def repeat(calls: list[tuple[Any, tuple]]) -> None:
     """Registers with Warp the calls of a program that was compiled in an earlier process.
 
-    Such a program is not traced again. It refers to each Warp call by a number. Warp numbers calls
-    in the order in which they are registered, so `CALLS` must be as it was when the program was
-    traced.
+    A compiled program is not traced again. It refers to each Warp call by a number. Warp numbers
+    calls in the order in which they are registered, so `CALLS` must be as it was when the program
+    was traced.
 
     Args:
       calls: the entries that tracing the program added to `CALLS`.

@@ -60,7 +60,7 @@ def cell_at(x: float, width: float) -> int:
 def cells_around(x: float, reach: float, width: float, across: int) -> wp.vec2i:
     """Returns the cells within reach of x along an axis: the first, and one past the last.
 
-    There are at most as many as the grid has (`across`); otherwise a robot would be found twice.
+    These are at most as many cells as the grid has (`across`), so that no robot is found twice.
     """
     first = cell_at(x - reach, width)
     return wp.vec2i(first, wp.min(cell_at(x + reach, width) + 1, first + across))

@@ -102,9 +102,9 @@ def kernels_of(solve: Any) -> Any:
     """Makes two kernels that compute the accelerations of the robots in many arenas.
 
     Args:
-      solve: a Warp function that takes a `WarpArena` and the first of the contacts to solve. At the
-        call, `total` of the arena equals `free`. The function sets `total` of the robots in these
-        contacts.
+      solve: a Warp function that takes a `WarpArena` and the first of the contacts to solve. When
+        it is called, `total` of the arena equals `free`. The function sets `total` of the robots in
+        these contacts.
 
     Returns:
       Two kernels for `launch`: the first one lists the contacts itself, the second one gets a list
@@ -190,7 +190,7 @@ def let_go(arena: WarpArena, first: int) -> None:
 
 @wp.func
 def _deal_out(arena: WarpArena, count: int, thread: int) -> int:
-    """Distributes the islands among the threads; returns this thread's first contact, or -1.
+    """Assigns the islands to the threads; returns this thread's first contact, -1 if it has none.
 
     Also sets all accelerations to their values without contacts.
     """

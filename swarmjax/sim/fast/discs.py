@@ -1,11 +1,11 @@
 """Steps the physics of planar robots as discs in the plane.
 
-A hull is a sphere between upright faces, so in the plane it is a disc. Contacts without friction
-(condim 1) push through its centre, so they move it along x and y and never turn it. MJX's own step
-does more: it builds every contact in three dimensions, and at every iteration of Newton's method it
-factorises one matrix for all robots. These two tasks take nine tenths of that step's time. The
-contact forces are the solution of MuJoCo's convex problem in its dual form (MuJoCo's documentation,
-Computation, "Dual problem"),
+A hull is a sphere between upright faces, so in the plane it is a disc. A contact without friction
+(condim 1) pushes through the disc's centre, so it never turns the disc. MJX's own step does more:
+it builds every contact in three dimensions, and at every iteration of Newton's method it factorises
+one matrix for all robots. These two tasks take nine tenths of that step's time. The contact forces
+are the solution of MuJoCo's convex problem in its dual form (MuJoCo's documentation, Computation,
+"Dual problem"),
 
     minimise over f >= 0:  1/2 f' (J M^-1 J' + R) f + f' (J a0 - aref).
 

@@ -32,7 +32,7 @@ _MISS = wp.constant(float("inf"))
 
 
 def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, limit: float) -> Array:
-    """Looks around from each robot of an arena; under `vmap`, one kernel computes all arenas.
+    """Finds what surrounds each robot of an arena; under `vmap`, one kernel computes all arenas.
 
     Args:
       scene: an arena.
@@ -51,7 +51,7 @@ def look(scene: Scene, poses: Sequence[Sequence[float]], hull_radius: float, lim
 def _look(
     poses: Sequence[Sequence[float]], hull_radius: float, limit: float, scene: Scene
 ) -> Array:
-    """Looks around from each robot of A arenas; returns [A, K + 3, R, 2] as `look` does."""
+    """Finds what surrounds each robot of A arenas; returns [A, K + 3, R, 2] as `look` does."""
     pose, side, obstacle, turn, shades = scene
     (arenas, robots), rows = pose.shape[:2], len(poses) + len(KINDS)
     threads = min(rows, max(1, _THREADS // (arenas * robots)))
@@ -91,7 +91,7 @@ def _cells(pose: Array, hull_radius: float, limit: float) -> tuple[Array, Array]
 
 @wp.struct
 class WarpLook:
-    """What a thread needs to look around from one robot, and where it writes what it finds.
+    """What a thread needs to find what surrounds one robot, and where it writes the result.
 
     Attributes:
       place: x (m), y (m), yaw (rad).
@@ -217,7 +217,7 @@ def _see_box(look: WarpLook, obstacle: wp.array[float], shade: float) -> None:
 
 @wp.func
 def _see(look: WarpLook, row: int, distance: float, shade: float) -> None:
-    """Updates a row if a surface is nearer, or brighter at the same distance, than its own."""
+    """Updates a row if a surface is nearer than the row's, or as near and brighter."""
     before = look.found[row, look.robot]
     if distance < before[0]:
         look.found[row, look.robot] = wp.vec2(distance, shade)
@@ -257,7 +257,7 @@ def _to_disc(ray: wp.vec4, centre: wp.vec3, radius: float) -> float:
 
 @wp.func
 def _to_box(ray: wp.vec4, box: WarpBox) -> float:
-    """Returns the distance to a turned rectangle, as in `infrared.ray_box`."""
+    """Returns the distance to a rotated rectangle, as in `infrared.ray_box`."""
     away_x, away_y = ray[0] - box.x, ray[1] - box.y
     x, y = box.cos * away_x + box.sin * away_y, box.cos * away_y - box.sin * away_x
     across_x = _cross(x, box.cos * ray[2] + box.sin * ray[3], box.half_x)

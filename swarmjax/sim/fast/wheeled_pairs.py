@@ -77,7 +77,7 @@ def relax_pairs(
 
 @wp.func
 def _far(problem: Problem, arena: int, robot: int, k: int, of_joints: wp.array2d[float]) -> float:
-    """Multiplies the entries of the other robot in a robot's row k by one value per joint."""
+    """Returns J times a vector, but only the other robot's part, for a robot's row k."""
     found = wp.float32(0.0)
     side = problem.row[arena, robot, k]
     if side[2] == wheeled.SHARED:
@@ -227,7 +227,7 @@ def _tilt(problem: Problem, arena: int, thread: int, threads: int, length: float
     for robot in range(thread, problem.own.shape[1], threads):
         if problem.touches[arena, robot]:
             for k in range(problem.own[arena, robot]):
-                # Each of the two robots of a shared row adds half of it.
+                # Both robots of a shared row add it, so each adds half.
                 part = wp.where(problem.row[arena, robot, k][2] == wheeled.SHARED, 0.5, 1.0)
                 lane = arena * problem.own.shape[1] + robot
                 tilt = tilt + part * wheeled.tilt_of(problem, k, lane, length)

@@ -53,8 +53,8 @@ class Problem:
       J_column: [A, 1, E] joint to which an entry belongs.
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
-      first: [A, N] the argument `side` of `entries_of` for a row's robot, or for the robot with the
-        higher index of two.
+      first: [A, N] the argument `side` of `entries_of` for a row's robot. If a row has two robots,
+        this is for the robot with the higher index.
       second: [A, N] the argument `side` for the other robot; -1 for none.
       own: [A, R] number of rows that involve a robot.
       row: [A, R, K] the indices of these rows, and where the robot's entries are in them: the
@@ -200,9 +200,10 @@ def entries_of(problem: Problem, arena: int, side: wp.vec3i) -> Vector:
     Args:
       problem: the problem.
       arena: index of the arena.
-      side: three numbers. The first is the index of the robot or of the row, and is not read here.
-        The second is the place of the body's six entries, which are stored from the last joint to
-        the first. The third is the wheel with an entry before those six entries.
+      side: three numbers. The first number is the index of the robot or of the row, and is not read
+        here. The second number is the place of the body's six entries, which are stored from the
+        last joint to the first. The third number is the wheel with an entry before those six
+        entries.
     """
     found = Vector()
     for i in range(6):

@@ -139,7 +139,8 @@ def _find_sides(problem: Problem) -> None:
 def _share_out(problem: Problem, together: Together) -> None:
     """Lists the rows that involve a robot.
 
-    If any robots of the arena touch each other, the thread of the first robot also lists the arena.
+    If any robots of the arena touch each other, the thread of the first robot also adds the arena
+    to `Together.arena`.
     """
     arena, robot = wp.tid()
     own = wp.int32(0)
