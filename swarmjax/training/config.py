@@ -33,8 +33,8 @@ class ProgramConfig(Section):
         "number of runs trained at once, with seeds seed, seed + 1, ...",
         1,
         4096,
-        reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
-        "a second run, with seed=4096",
+        reason="a call of the compiled program reports one row per seed, at most 4096. Train more "
+        "in a second run, with seed=4096",
     )
     seeds_by: Literal["vmap", "cores", "devices"] = setting(
         "vmap",
@@ -70,7 +70,7 @@ class ProgramConfig(Section):
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
-        metadata=about("digest of each part of extensions in use, by kind and name", derived=True),
+        metadata=about("digest of each extension piece in use, by kind and name", derived=True),
     )
 
     @property
