@@ -1,7 +1,7 @@
 """Realism factors of one episode: the properties of its robots, sensors and surfaces.
 
-All factors follow from the episode's seed, so they are part of the level. The code takes the array
-module as an argument, so NumPy and JAX draw the same factors.
+The level's seed determines all factors. The code takes the array module as an argument, so NumPy
+and JAX draw the same factors.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Settings that draw random numbers at every control step. These settings need the seed as well.
+# Settings that draw random numbers at every control step; an episode with one keeps its seed.
 _PER_STEP = ("speed_noise", "target_distance_noise", "target_bearing_noise")
 
 
@@ -23,19 +23,19 @@ class Factors(NamedTuple):
     """The factors of an episode; a factor that is off is None.
 
     Attributes:
-      seed: [...] uint32 seed of everything drawn at each control step; None without randomness.
+      seed: [...] uint32 seed of the numbers drawn at each control step; None if nothing is random.
       wheel_radius: [..., R, 2] radius of the left and the right wheel, m.
       track: [..., R] effective track, m.
       max_wheel_speed: [..., R] rad/s.
       mass: [..., R] kg.
       friction: [..., R] friction between wheels and floor.
-      infrared_noise: [..., R, K] factor on the noise of the response.
-      infrared_gain: [..., R, K] factor on the reflected part of the response.
-      infrared_yaw: [..., R, K] rad.
+      infrared_noise: [..., R, K] factor on the noise of the sensor counts.
+      infrared_gain: [..., R, K] factor on the reflected part of the sensor counts.
+      infrared_yaw: [..., R, K] yaw error of the sensor, rad.
       infrared_period: [..., R] s between samples.
       dead_sensor: [..., R, K] whether the sensor never detects anything.
-      reflectance: [..., 1 + M] of all walls, and of each obstacle.
-      reflectance_robot: [..., R].
+      reflectance: [..., 1 + M] reflectance of all walls, then of each obstacle.
+      reflectance_robot: [..., R] reflectance of the robot.
       action_latency: [..., R] control steps, int32.
       observation_latency: [..., R] control steps, int32.
     """
@@ -80,7 +80,7 @@ def _normal(deviation: Any, drawn: Array, xp: Any) -> Array:
 
 
 # How the factor of each setting is drawn, and its axes: R robots, K sensors, F walls and obstacles.
-# Each has the random stream of its name.
+# The random stream of a factor has the same name.
 _DRAWN = {
     "wheel_radius": (_uniform, "R"),
     "track": (_uniform, "R"),
@@ -109,7 +109,7 @@ def draw(
 ) -> Factors:
     """Draws the factors of an episode.
 
-    Each factor has its own random numbers, so switching one off leaves the others unchanged.
+    Each factor has its own random stream, so switching one off leaves the others unchanged.
     Adding robots leaves the factors of the existing robots unchanged. `configs/realism/` holds the
     ranges and their sources.
 
@@ -151,14 +151,14 @@ def draw(
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """Returns the robot to compile the model for, with the largest values of any episode.
+    """Returns the robot to compile the model for, with the largest wheels of any episode.
 
     Args:
       robot: the nominal robot.
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius that no draw exceeds; its speeds are not for driving.
+      The robot, with the largest wheel radius that can be drawn. Do not take speed limits from it.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     return replace(robot, wheel_radius=most, wheel_limit="clip")

@@ -21,7 +21,7 @@ class Step(NamedTuple):
 
     Attributes:
       distance_before: [R] distance to the target, m.
-      distance: [R] distance after the step to the same target, m; it may move only then.
+      distance: [R] distance after the step, to where the target was during the step, m.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
@@ -101,7 +101,7 @@ def step_penalty(step: Step) -> Array:
 
 
 def _number(step: Step, values: Array) -> Array:
-    """Returns values as numbers of the kind of the distances."""
+    """Converts values to the number type of the distances."""
     return values.astype(step.distance.dtype)
 
 

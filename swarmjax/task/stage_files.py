@@ -1,4 +1,4 @@
-"""Finds the stages that a choice of configs/stage/ names: one stage or a sequence."""
+"""Reads the files of configs/stage/, each of which holds one stage or a sequence of stages."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
       choice: the name of its file.
 
     Raises:
-      ConfigError: the file or its sequence is invalid, or the file does not take these keys.
+      ConfigError: the file or its sequence is invalid, or keys are set for a sequence.
     """
     if not _is_sequence(choice):
         return [_named(stage, choice)]
@@ -131,7 +131,7 @@ def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
 
 
 def _check_name(stage: dict[str, Any], choice: str) -> None:
-    """Refuses a name that is not the file's."""
+    """Refuses a stage whose name is not that of its file."""
     name = name_of(choice)
     given = stage.get("name", name)
     if given != name:

@@ -50,7 +50,7 @@ class Moving(Navigate):
         xp = level.target.__array_namespace__()
         turn = super().advance(state, level, view)
         moved = level.target + state * self.sizes.control_step
-        # Where a robot cannot get, a target does not go either.
+        # Targets keep a hull radius from the walls, so that robots can reach them.
         most = (level.side / 2.0 - self.sizes.hull_radius)[..., None, None]
         velocity = xp.where(xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state), state)
         target = xp.where(view.present[..., None], xp.clip(moved, -most, most), level.target)
