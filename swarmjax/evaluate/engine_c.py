@@ -343,8 +343,8 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down: some positions are not finite; give a sim.substeps of more "
-            f"than {judge.substeps}, or a robot closer to the e-puck."
+            "the physics broke down: some positions are not finite; give substeps of more than "
+            f"{judge.substeps}, or a robot closer to the e-puck."
         )
     return memory, body.pose(qpos, np)
 

@@ -102,7 +102,7 @@ def play(
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down: some "
-            f"positions are not finite; give a sim.substeps of more than {world.physics.substeps}."
+            f"positions are not finite; give substeps of more than {world.physics.substeps}."
         )
     return Outcome(*map(np.asarray, outcome))
 

@@ -95,8 +95,8 @@ def cvar(
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
     It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
-    rounded up to whole values, so it is never empty. If each level was tried only once, the result
-    is worse than for the levels' expected values, because it also contains bad luck.
+    rounded up to whole values, so it is never empty. If each level was tried only once, the worst
+    results include bad luck.
 
     Args:
       x: [...] of any unit.

@@ -113,16 +113,9 @@ def draw(
     Adding robots leaves the factors of the existing robots unchanged. `configs/realism/` holds the
     ranges and their sources.
 
-    The factors are drawn per robot, per sensor or per surface, according to their cause:
-
-    - Wheel radius: each robot draws one radius for both wheels.
-    - Track: each robot draws its effective track, since tyres grip somewhere across their width.
-    - Latency and sampling period: each robot draws its own, since radio link and firmware determine
-      them.
-    - Gain and yaw: each sensor draws its own.
-    - Reflectance: each obstacle and each robot draws its own. All walls of the arena share one
-      reflectance.
-    - Friction: each robot draws the friction of its wheels on the floor.
+    `Factors` lists the factors of each robot, sensor and surface. Both wheels of a robot have the
+    same radius. Robots differ in effective track, since tyres grip somewhere across their width,
+    and in latency and sampling period, since these depend on radio link and firmware.
 
     Args:
       seed: [...] uint32, one per episode.

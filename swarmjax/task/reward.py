@@ -3,7 +3,7 @@
 Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
 To add a built-in term, add a function, a row of `TERMS`, a weight in `RewardConfig` and a test.
 Terms of an extension need no change here; see `swarmjax.extension.reward_term`.
-Training gives JAX arrays and replays give NumPy arrays; the terms use the module of their arrays.
+Terms take JAX arrays in training and NumPy arrays in replays.
 """
 
 from collections.abc import Callable, Sequence

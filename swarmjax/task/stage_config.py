@@ -72,7 +72,7 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfig(Section):
-    """One stage: number of robots, arena size and obstacles."""
+    """Settings of one stage: number of robots, arena size and obstacles."""
 
     name: str = field(metadata=about("name of the stage, equal to the name of its file"))
     robots: int = field(metadata=about("number of robots", 1, 1024))

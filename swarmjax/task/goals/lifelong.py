@@ -34,7 +34,7 @@ class Errands(NamedTuple):
 
 
 class Lifelong(Goal):
-    """Every robot is sent from place to place; no two robots have the same place at a time."""
+    """Every robot is sent from place to place; no two robots have the same place at once."""
 
     ends = "never"
     measures: Mapping[str, Measure] = {
