@@ -220,7 +220,7 @@ def _step(
 
 
 def _events(world: World, before: EnvState, after: EnvState, came: env.TimeStep) -> measures.Events:
-    """Returns the events of a control step; `env.step` has counted contacts and infrared."""
+    """Returns the events of a control step, partly from the counters of `env.step`."""
     poses = jax.vmap(partial(physics.poses, world.physics))
     return measures.Events(
         start=poses(before.sim)[..., :2],

@@ -31,14 +31,14 @@ class Outcome(NamedTuple):
       arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
         control steps until it came to its target for the last time.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
-      touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
+      touched: [A, R, 3] control steps that ended with the robot in contact, also after arrival.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.
       moving: [A, R] control steps before arrival; with `hold`, control steps that began outside the
         target.
       path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
       still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of
         `anchor`; 0 if it has arrived.
-      anchor: [A, R, 2] the place where it last began to stand still, m.
+      anchor: [A, R, 2] the place where the robot last began to stand still, m.
       measured: [A, K] the goal's own measures.
     """
 

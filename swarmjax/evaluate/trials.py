@@ -151,7 +151,7 @@ def _by_mjx(
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
-    """Runs each cell at once in the training engine."""
+    """Runs all levels of a cell at once in the training engine."""
     from swarmjax.evaluate import engine_mjx
     from swarmjax.run import compile_cache  # these modules need JAX
 
@@ -251,7 +251,7 @@ def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:
       levels: [E].
 
     Returns:
-      [E, R] m; inf where there is no path for any robot.
+      [E, R] m; inf where there is no path.
     """
     start, hull, reach = levels.start[..., :2], config.robot.hull_radius, config.task.target_radius
     return shortest_path.shortest(levels.side, start, levels.target, levels.obstacle, hull, reach)

@@ -21,7 +21,7 @@ Arrival = Literal["latch", "hold"]
 
 
 def _weight(default: float, meaning: str) -> Any:
-    """Returns the field of a reward weight."""
+    """Makes the setting of a reward weight."""
     return setting(default, meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 

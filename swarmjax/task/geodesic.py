@@ -246,9 +246,9 @@ def _is_barred(begin: _Places, end: _Places, level: Level, off: float) -> Array:
     The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
 
     Args:
-      begin: where the segments begin; the axes after the obstacle axis broadcast.
-      end: where the segments end.
-      level: provides the obstacles.
+      begin: places where the segments begin.
+      end: places where the segments end; the axes after the obstacle axis broadcast with `begin`.
+      level: the level, whose obstacles are tested.
       off: m.
 
     Returns:

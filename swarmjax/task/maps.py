@@ -147,7 +147,7 @@ def _check_reach(
     targets: Sequence[Cell],
     pairs: Sequence[tuple[Cell, Cell]],
 ) -> None:
-    """Refuses a target that no sequence of steps between adjacent cells can reach."""
+    """Refuses a target that cannot be reached by steps between adjacent cells."""
     if bool(starts) != bool(targets) or not (starts or pairs):
         raise ConfigError(
             f"map has {len(starts)} cells with S and {len(targets)} with T: give both, or a letter "

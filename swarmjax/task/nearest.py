@@ -21,8 +21,7 @@ def nearest(distance: Array, count: int) -> Array:
       count: how many objects to return, at most N.
 
     Returns:
-      [..., count] indices, nearest first. Of two objects at the same distance, the first one comes
-      first.
+      [..., count] indices, nearest first. Objects at the same distance keep their order.
     """
     if distance.shape[-1] > _MOST_COUNTED:
         return jnp.argsort(distance, axis=-1, stable=True)[..., :count]

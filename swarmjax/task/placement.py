@@ -232,8 +232,8 @@ def fold(
 
 
 def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S:
-    """Calls `step(i, state)` for each i below `count`; XLA takes long to compile it unrolled."""
-    if xp is not np and count:  # JAX traces the step even if it is called for nothing
+    """Calls `step(i, state)` for each i below `count`, not unrolled, so that XLA compiles fast."""
+    if xp is not np and count:  # JAX would trace the step even if `count` is 0
         from jax import lax  # evaluations draw levels without JAX
 
         return lax.fori_loop(0, count, step, state)

@@ -31,7 +31,7 @@ class Step(NamedTuple):
       outside: [R] whether the robot had not yet arrived when the step began.
       path_before: [R] distance along the shortest path to the target, m. None for a reward without
         a path weight, and for terms of an extension.
-      path: [R] the same distance after the step, m.
+      path: [R] distance along the shortest path after the step, m.
       pose_before: [R, 3] x (m), y (m), yaw (rad). This field and the fields below are for
         extensions only.
       pose: [R, 3] the pose after the step.

@@ -50,7 +50,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
 
     Args:
       choice: the name of the file.
-      key: the key that names it, for messages.
+      key: the key that names the file, for messages.
 
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
@@ -67,12 +67,11 @@ def load_levels[C: Section](
 
     Args:
       cls: the command's dataclass, with `stage` and `suite`.
-      overrides: `key=value` words.
+      overrides: `key=value` arguments.
       stage: plain data of the default stage; None for the stage of the command's file.
 
     Raises:
-      ConfigError: a word is invalid, or a suite is given together with a key that the suite sets
-        itself.
+      ConfigError: an argument is invalid, or sets a key that the suite sets itself.
     """
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:

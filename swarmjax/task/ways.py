@@ -241,8 +241,8 @@ def _block(
 
     The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
-    # Twice the middle of the leg, and the leg. In an arena of 4 m they are at most 2**15 and 2**14
-    # from a wall's centre, so an int32 holds the sum of two products.
+    # `middle` is twice the middle of the leg. In an arena of 4 m, twice the middle is at most 2**15
+    # from a wall's, and the leg at most 2**14 long, so an int32 holds the sum of two products.
     middle, across = begin[:, None] + end[None], end[None] - begin[:, None]
     centre, half = 2 * rectangle[:, :2], 2 * (rectangle[:, 2:] + widened)
 

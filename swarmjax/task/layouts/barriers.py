@@ -152,7 +152,7 @@ def draw_door(uniforms: Array, site: Site, xp: Any) -> Drawn:
     most = xp.maximum(half_y - aside - jamb, 0)
     door = pick(position[1], -most, most, xp)
     halls = [_hall(site, where, side, shifts, xp) for side in (-1, 1)]
-    away = Gap(site.numbers.apart, site.numbers.apart)  # kept even where there is little room
+    away = Gap(site.numbers.apart, site.numbers.apart)  # hard: kept even in a small hall
     middle = xp.stack([where, door])[None]
     right = np.arange(count) % 2 == 0
     going = (site.present & right, site.present & ~right)

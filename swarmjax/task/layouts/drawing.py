@@ -93,7 +93,7 @@ def draw(
     Args:
       kind: the layout, with its settings that are fixed at compile time.
       of: ranges of the layout's lengths in one stage.
-      uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
+      uniforms: [uniform_count(kind, R) or more] float32 in [0, 1); the only source of randomness.
       present: [R] whether the robot is present.
       hull: radius of the robots, m.
       reach: distance at which a robot has arrived, m.

@@ -33,7 +33,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The layout; boxes are turned by 0 degrees.
+      The layout; boxes are not turned.
     """
     robots, boxes = site.present.shape[0], site.cells
     count, objects = along(robots, boxes), 2 * robots + boxes
