@@ -288,7 +288,7 @@ def _move(
     chassis = task_electronics.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
-    # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
+    # A broken arena keeps its last finite poses until it is reset, so other numbers stay finite.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
     return data, memory, jnp.where(sound, after, before), sound
 

@@ -26,18 +26,18 @@ class Factors(NamedTuple):
       seed: [...] uint32 seed of the numbers drawn at each control step; None if nothing is random.
       wheel_radius: [..., R, 2] radius of the left and the right wheel, m.
       track: [..., R] effective track, m.
-      max_wheel_speed: [..., R] rad/s.
-      mass: [..., R] kg.
+      max_wheel_speed: [..., R] speed limit of each wheel, rad/s.
+      mass: [..., R] mass of the robot, kg.
       friction: [..., R] friction between wheels and floor.
       infrared_noise: [..., R, K] factor on the noise of the sensor counts.
       infrared_gain: [..., R, K] factor on the reflected part of the sensor counts.
       infrared_yaw: [..., R, K] yaw error of the sensor, rad.
-      infrared_period: [..., R] s between samples.
+      infrared_period: [..., R] time between samples, s.
       dead_sensor: [..., R, K] whether the sensor never detects anything.
       reflectance: [..., 1 + M] reflectance of all walls, then of each obstacle.
       reflectance_robot: [..., R] reflectance of the robot.
-      action_latency: [..., R] control steps, int32.
-      observation_latency: [..., R] control steps, int32.
+      action_latency: [..., R] delay of commands, control steps, int32.
+      observation_latency: [..., R] delay of observations, control steps, int32.
     """
 
     seed: Array | None = None

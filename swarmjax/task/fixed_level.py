@@ -75,7 +75,7 @@ def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
     Args:
       count: M.
       side: [] side of the arena, m.
-      fenced: [] whether the obstacles are the fence.
+      fenced: [] whether to place the fence instead of boxes.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

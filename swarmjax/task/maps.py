@@ -55,11 +55,11 @@ class MapArrays(NamedTuple):
     Attributes:
       mapped: whether the stage has a map, bool.
       wall: [W, 5] walls, as in `Map`, float32.
-      start: [C, 2] starts in units, int32.
+      start: [C, 2] starts, 1/4096 m, int32.
       start_open: [C] whether the start is a point of this stage, bool.
-      target: [D, 2] targets in units, int32.
+      target: [D, 2] targets, 1/4096 m, int32.
       target_open: [D] whether the target is a point of this stage, bool.
-      pair: [P, 2, 2] pairs in units, int32.
+      pair: [P, 2, 2] start and target of each pair, 1/4096 m, int32.
       pairs: number of pairs that the stage has, int32.
     """
 

@@ -114,7 +114,7 @@ class Goal:
         return found._replace(arrived=view.arrived | found.arrived)
 
     def is_near(self, view: View) -> Array:
-        """Returns whether each robot [..., R] is within its target."""
+        """Returns whether each robot [..., R] is within `target_radius` of its target."""
         return view.distance <= self.sizes.target_radius
 
     def drives(self, arrived: Array) -> Array:

@@ -2,9 +2,9 @@
 
 `task.arrival` says when a robot has arrived:
 
-- `latch`: a robot that comes within its target has arrived and stops for good.
-- `hold`: a robot counts as arrived while it is within its target, but it keeps driving and may
-  leave. An episode is over once all robots are within their targets in the same control step.
+- `latch`: a robot that comes within `target_radius` of its target has arrived and stops for good.
+- `hold`: a robot counts as arrived while it is within that radius, but it keeps driving and may
+  leave. An episode is over once all robots have arrived in the same control step.
   Multi-agent path finding calls this condition "stay at target" (Stern et al. 2019, "Multi-Agent
   Pathfinding: Definitions, Variants, and Benchmarks").
 """
