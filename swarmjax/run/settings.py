@@ -18,7 +18,7 @@ class RunConfig(Section):
     id: str | None = setting(None, "random id, drawn when the run begins", derived=True)
     dir: str | None = setting(None, "run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     chunk: int | Literal["auto"] = setting(
-        "auto", "updates per call of the compiled program; auto: about a second's", 1, MAX_COUNT
+        "auto", "updates per call of the compiled program; auto: a second's worth", 1, MAX_COUNT
     )
     checkpoint_minutes: float = setting(
         1.0, "minutes between checkpoints; 0: after every chunk", 0.0

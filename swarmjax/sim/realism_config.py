@@ -68,7 +68,7 @@ class RealismConfig(Section):
         None, "radius of the wheels, m; per robot and episode", LEAST, below=0.03
     )
     track: tuple[float, float] | None = setting(
-        None, "effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
+        None, "as robot.effective_track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
     )
     max_wheel_speed: tuple[float, float] | None = setting(
         None, "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL

@@ -39,7 +39,7 @@ class RewardConfig(Section):
     arrival: float = _weight(
         0.0,
         "once, on arrival; arrival=hold or goal=gather: when all robots have arrived; "
-        "goal=lifelong: at each target; goal=cover: in each step in which it sees new floor",
+        "goal=lifelong: at each target; goal=cover: in each step in which the robot sees new floor",
     )
     contact: float = _weight(-0.2, "per contact event of any kind")
     touching: float = _weight(0.0, "per control step in which the robot touches something")

@@ -51,7 +51,7 @@ class ProgramConfig(Section):
     )
     streams: int | None = setting(
         None,
-        "number of random streams, a multiple of devices; runs with as many streams draw the same "
+        "number of random streams, a multiple of devices; runs with equal streams draw the same "
         "random numbers on any number of devices; null: one for each device that shares the arenas",
         1,
         2**16,
@@ -60,7 +60,7 @@ class ProgramConfig(Section):
     levels_per_rollout: int | None = setting(
         None,
         "levels drawn for each arena before a rollout; an arena that needs more repeats the last "
-        "level, and no success counts these repeats; null: one for every 32 control steps",
+        "level, and success does not count these repeats; null: one for every 32 control steps",
         1,
         1024,
     )

@@ -438,7 +438,7 @@ def test_help_gives_default_meaning_and_allowed_values():
     assert "stage.robots=<the stage> number of robots (a whole number 1 to 1024)" in lines
     assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
-        "run.chunk=auto updates per call of the compiled program; auto: about a second's "
+        "run.chunk=auto updates per call of the compiled program; auto: a second's worth "
         "(a whole number 1 to 2147483647 or auto)" in lines
     )
     assert (
