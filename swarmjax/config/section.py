@@ -102,7 +102,7 @@ class Section:
 
     Attributes:
       command: name of the command's file in configs/, if the section holds all keys of a command.
-      inherited: for each section by name, where its values come from if no word sets them.
+      inherited: for each section by name, where its values come from if no argument sets them.
       shared: the keys and sections that a file for the whole config, such as a recipe, may set.
     """
 
@@ -148,7 +148,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
 
 
 class ByName(dict[str, Any]):
-    """A mapping from names, which no section defines, to values.
+    """A mapping whose keys are names that no section defines.
 
     A `ByName` is never changed, so that settings are hashable.
     """
@@ -253,7 +253,7 @@ def convert(hint: object, value: object, key: str) -> object:
 
 
 def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
-    """Converts a list of values of one type. Errors in one of several sections give its name."""
+    """Converts a list of values of one type; messages call each of several sections by its name."""
     if not isinstance(value, list | tuple):
         raise ConfigError(f"{key} is {show(value)}: give {values.describe(hint)}.")
     inner = typing.get_args(hint)[0]
@@ -266,7 +266,7 @@ def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
 
 
 def _by_name(hint: object, value: object, key: str) -> ByName:
-    """Converts a mapping from names, which no section defines, to values of one type."""
+    """Converts a mapping whose values have one type, and whose keys no section defines."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"{key} is {show(value)}: give named values, as in {key}.NAME=1.")
     for name in value:
@@ -296,7 +296,7 @@ def _plain(value: object) -> object:
 
 
 def names(cls: type[Section]) -> list[str]:
-    """Returns the keys and sections with which a word of the command line may begin."""
+    """Returns the keys and sections with which an argument of the command line may begin."""
     return [item.name for item in dataclasses.fields(cls) if not _is_derived(item)]
 
 

@@ -35,8 +35,8 @@ class CurriculumConfig(Section):
     axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
         default_factory=ByName,
         metadata=about(
-            "easier values of the stage's numbers: a list from easy to hard for each name; each "
-            "combination becomes a stage, and mode is frontier unless given"
+            "for each key of the stage, a list of easier values, from easy to hard; each "
+            "combination becomes a stage, and mode is frontier by default"
         ),
     )
     success: Literal["targets", "all"] = setting(
@@ -69,14 +69,14 @@ class CurriculumConfig(Section):
     )
     shares: Literal["arenas", "robots"] = setting(
         "arenas",
-        "what the stages' weights are shares of; robots: a stage with many robots gets fewer "
-        "arenas, so that the numbers of samples follow the weights [adaptive]",
+        "what the stages' weights are shares of; robots: a stage with more robots gets fewer "
+        "arenas, so that its weight is its share of all robots [adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
         "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep", "exploration after a promotion; reset: from algo.initial_std [sequential, mixed]"
+        "keep", "SD of actions after a promotion; reset: algo.initial_std [sequential, mixed]"
     )
 
     def _check(self) -> None:

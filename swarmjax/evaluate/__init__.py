@@ -1,7 +1,7 @@
-"""Judges policies on levels that they never trained on, in an engine that did not train them.
+"""Evaluates policies on levels and in an engine in which they were not trained.
 
-It imports `task`, `sim` and policy files, and no JAX. Two modules import more: `engine_mjx.py`
-judges on the device and imports `training` and `ppo` too, and `trials.py` stores its programs in
-`run`'s cache. `cells.py` draws or reads the levels, `trials.py` runs the episodes, and
-`measures.py` and `statistics.py` compute the figures. Start with `evaluation.evaluate`.
+The package imports `task`, `sim` and policy files, and no JAX. Two modules import more:
+`engine_mjx.py` evaluates on the device and imports `training` too, and `trials.py` stores its
+programs in `run`'s cache. `cells.py` draws or reads the levels, `trials.py` runs the episodes, and
+`measures.py` and `statistics.py` compute the metrics. Start reading at `evaluation.evaluate`.
 """

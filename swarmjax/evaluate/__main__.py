@@ -1,10 +1,10 @@
-"""`python -m swarmjax.evaluate policy=FILE suite=stages`: judges policies on levels never seen.
+"""`python -m swarmjax.evaluate policy=FILE suite=stages`: evaluates policies on new levels.
 
 `cells.py` draws the levels, `trials.py` runs the episodes, and `summary.py` summarises them. This
-module joins them, and writes and shows the result.
+module calls them, and writes and shows the result.
 
 Examples:
-  # 1,000 levels of its last stage, on wheels
+  # 1,000 levels of the last stage of training, on wheels
   python -m swarmjax.evaluate policy=runs/first/policy.npz
   # another stage, and the planar body
   python -m swarmjax.evaluate policy=runs/first/policy.npz stage=s3 robot=planar
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _content(out: Path, evaluation: Evaluation) -> dict[Path, bytes]:
-    """Makes the JSON file, or all files of a folder."""
+    """Makes the contents of the JSON file, or of all files of a folder."""
     text = (json.dumps(evaluation.result, indent=2, allow_nan=False) + "\n").encode()
     if out.suffix == ".json":
         return {out: text}

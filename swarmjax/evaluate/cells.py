@@ -1,8 +1,8 @@
-"""Cells: sets of levels for judging policies, drawn from numbers or read from a file.
+"""Cells: sets of levels for judging policies, drawn from a seed or read from a file.
 
-A suite is a list of cells. A cell may have a digest of its levels. By comparing digests, everybody
-who draws the levels can check that every bit is the same. Levels of a suite are drawn for the
-nominal e-puck.
+A suite is a list of cells. A cell may have a digest of its levels. Whoever draws the levels can
+compare digests to check that every bit is the same. Levels of a suite are drawn for the nominal
+e-puck.
 """
 
 import json
@@ -35,11 +35,11 @@ class Cell(NamedTuple):
     Attributes:
       name: Name of the cell.
       stage: Settings of the stage.
-      realism: Name of a preset, or None for the command's preset.
+      realism: Name of a preset; None for that of the command.
       seed: Seed of the levels.
-      episodes: [E] numbers of the levels.
+      episodes: [E] indices of the levels.
       levels: [E] levels.
-      steps: Control steps of an episode, or None for the command's number.
+      steps: Control steps of an episode; None for the number of the command.
     """
 
     name: str
@@ -83,7 +83,7 @@ def load(config: EvaluateConfig) -> Suite:
       The suite that the settings name, or one cell with their stage.
 
     Raises:
-      ConfigError: The suite is unsound, or made for smaller robots or other targets.
+      ConfigError: The suite is invalid, or made for smaller robots or other targets.
     """
     if config.suite is None:
         return Suite(None, (draw_stage(config, range(config.episodes)),))
@@ -112,7 +112,7 @@ def draw(choice: str) -> Suite:
       The suite.
 
     Raises:
-      ConfigError: The file is unsound, or a digest is wrong.
+      ConfigError: The file is invalid, or a digest is wrong.
     """
     file = read_suite(choice)
     return Suite(file.name, tuple(map(draw_cell, file.cells)))
@@ -123,10 +123,10 @@ def draw_stage(config: EvaluateConfig, numbers: Sequence[int]) -> Cell:
 
     Args:
       config: Settings of the evaluation; its suite is ignored.
-      numbers: [E] numbers of the levels.
+      numbers: [E] indices of the levels.
 
     Returns:
-      The cell, under the stage's name.
+      The cell, named after the stage.
     """
     stage, radii = config.stage, (config.robot.hull_radius, config.task.target_radius)
     drawings = extension.load(config.extensions).levels
@@ -138,7 +138,7 @@ def draw_cell(cell: CellConfig) -> Cell:
     """Draws the levels of a suite's cell.
 
     Raises:
-      ConfigError: The cell has another digest.
+      ConfigError: The levels do not have the digest that the cell records.
     """
     numbers, radii = cell.episodes or range(cell.levels), (epuck.HULL_RADIUS, _TARGET_RADIUS)
     levels = _draw(cell.stage, cell.seed, numbers, radii)
@@ -164,7 +164,7 @@ def _draw(
     radii: tuple[float, float],
     drawings: Sequence[LevelDrawing] = (),
 ) -> Level:
-    """Draws levels with these numbers, for hulls and targets with these radii, m."""
+    """Draws levels with these indices, for hulls and targets with these radii, m."""
     one = task_stage.single(stage, drawings)
     spacing = level.Spacing(stage.robots, stage.obstacles, *radii)
     drawn = [judge.draw_level(one, spacing, seed, each, drawings) for each in numbers]
@@ -184,7 +184,7 @@ def _arrays(cell: Cell) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, suite: Suite) -> None:
-    """Writes levels that no settings describe; docs/evaluation.md lists the fields.
+    """Writes a suite to a file; docs/evaluation.md lists the fields.
 
     Args:
       path: Path of the .npz file.
@@ -218,7 +218,7 @@ def read(path: Path) -> Suite:
       The suite.
 
     Raises:
-      ConfigError: The file is unsound.
+      ConfigError: The file is invalid.
     """
     check_text("suite", str(path))
     try:

@@ -11,11 +11,11 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.stage_config import StageConfig
 
-# What a judge's robot has unless a robot file or a word says otherwise. Hulls rub on hulls, boxes
-# and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
+# Settings of a judge's robot, unless a robot file or an argument sets them. Hulls rub on hulls,
+# boxes and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
 JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
-STEPS = 1500  # control steps of an episode by default; Table 1
+STEPS = 1500  # control steps of an episode by default; Table 1 of the paper
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
 # Values that `trained_settings.load` takes from the policies.
 AS_TRAINED = {
@@ -36,25 +36,25 @@ class JudgeConfig(Section):
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(**JUDGED))
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = setting(
-        None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"
+        None, "suite instead of a stage: a name in configs/suites/, or a .yaml or .npz file"
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
     action: Literal["sampled", "mean"] = setting(
         "sampled",
-        "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
-        "the policy's most likely action",
+        "robots' actions; sampled: from the policy's distribution, repeatably for each level; "
+        "mean: the most likely action",
     )
     steps: int | None = setting(
         None,
-        f"control steps of an episode; null: as in the suite's cell, else {STEPS} (Table 1)",
+        f"control steps of an episode; null: as in the suite's cell, else {STEPS}",
         1,
         MOST_STEPS,
     )
-    episodes: int = setting(1000, "episodes", 1, MOST_EPISODES)
+    episodes: int = setting(1000, "number of episodes", 1, MOST_EPISODES)
     seed: int = setting(1, "random seed of the levels", 0, MAX_COUNT)
-    workers: int | None = setting(None, "processes; null: one per core", 1, 1024)
+    workers: int | None = setting(None, "number of processes; null: one per core", 1, 1024)
     substeps: int | None = setting(
-        None, "physics steps per control step; null: the body's default", 1, 1000
+        None, "physics steps per control step; null: 1 for planar, 4 for wheeled", 1, 1000
     )
     extensions: str | None = setting(
         None, "Python file with the policies' extension; it is executed"
@@ -76,10 +76,10 @@ class EvaluateConfig(JudgeConfig):
     command: ClassVar[str] = "evaluate"
 
     policy: str | None = setting(
-        None, "policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"
+        None, "policy.npz, or those of several seeds: a.npz,b.npz or a pattern"
     )
     compare: str | None = setting(
-        None, "two recipes instead, compared level by level: a.npz,b.npz, or patterns"
+        None, "instead of policy: two policies or patterns to compare, as a.npz,b.npz"
     )
     engine: Literal["c", "mjx"] = setting("c", "c: MuJoCo's C engine; mjx: the engine of training")
     out: str | None = setting(None, "folder for result.json and levels.csv, or a single .json file")

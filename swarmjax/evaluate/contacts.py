@@ -7,7 +7,7 @@ from swarmjax.sim import gaps
 
 
 def touching(judge: Judge, data: np.ndarray) -> np.ndarray:
-    """Tells which robots touch anything.
+    """Finds which robots touch another robot, an obstacle or a wall.
 
     Args:
       judge: Data that the arenas share.

@@ -1,11 +1,11 @@
 """Episodes in MuJoCo's C engine: the independent judge of policies.
 
-It is independent of training in four ways: the policy is computed with NumPy, the engine is another
-one, its solver converges, and the infrared sensors are MuJoCo's rays on the real shapes. Training
-and judge share only the rules of the task; a step here mirrors `task/env.py`. No JAX.
+The judge differs from training in four ways: NumPy computes the policy, the engine is another one,
+its solver converges, and MuJoCo casts the infrared rays on the real shapes. Training and judge
+share only the rules of the task; a step here mirrors `task/env.py`. No JAX.
 
-Episode n of a seed always starts from the same level, and every arena is computed by itself. So a
-result does not depend on how the work is split up.
+Episode n of a seed always starts from the same level, and every arena is computed by itself. So the
+results do not depend on how episodes are split over processes.
 """
 
 import copy
@@ -43,7 +43,7 @@ class Arenas(NamedTuple):
       data: [A] of `MjData`, positions up to date.
       factors: [A] factors of the episodes' robots.
       memory: [A] state of the robots' electronics.
-      target: [A, R, 2] targets of now, x (m), y (m).
+      target: [A, R, 2] current targets, x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       level: [A] levels that the episodes started from.
       goal: [A] state of the goal.
@@ -89,9 +89,9 @@ def act(
 
 
 def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
-    """Runs episodes side by side, each until all its robots have arrived or the time is out.
+    """Runs episodes side by side, each until all its robots have arrived or it reaches its limit.
 
-    With `task.arrival=hold` an episode ends once all its robots are within their targets.
+    With `task.arrival=hold` an episode ends once all its robots are at their targets.
 
     Args:
       judge: Data that the arenas share.
@@ -139,7 +139,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
 
     Args:
       judge: Data that the arenas share.
-      levels: [A], with the judge's numbers of robots and boxes.
+      levels: [A], with as many robots and boxes as the judge.
 
     Returns:
       The arenas at rest, with their first observations.
@@ -242,12 +242,12 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
 
     Args:
       judge: Data that the arenas share.
-      arenas: Their state before.
+      arenas: The arenas before the step.
       action: [A, R, U] actions of the robots, -1..1; None: the policy chooses them, and must have
         no memory.
 
     Returns:
-      Their state after.
+      The arenas after the step.
 
     Raises:
       ConfigError: A position is not finite.
@@ -296,7 +296,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
 def _turn(
     judge: Judge, arenas: Arenas, sight: Sight, pose: np.ndarray
 ) -> tuple[Turn, Level, Sight]:
-    """Asks the goal; returns its answer, levels with the new targets, and the sight of them."""
+    """Asks the goal; returns its turn, levels with the new targets, and their distance in sight."""
     levels, before = arenas.level._replace(target=arenas.target), arenas.outcome
     view = electronics.view(sight, pose, levels, before.arrived, before.clock + 1)
     turn = judge.goal.turn(arenas.goal, levels, view)
@@ -343,8 +343,8 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down: some positions are not finite; give a sim.substeps of more "
-            f"than {judge.substeps}, or a robot closer to the e-puck."
+            "the physics broke down: some positions are not finite; give substeps of more than "
+            f"{judge.substeps}, or a robot closer to the e-puck."
         )
     return memory, body.pose(qpos, np)
 
@@ -367,7 +367,7 @@ def look(
     target: np.ndarray,
     obstacle: np.ndarray,
 ) -> Sight:
-    """Finds what the sensors can see.
+    """Measures what the sensors can see.
 
     Args:
       judge: Data that the arenas share.
@@ -378,7 +378,7 @@ def look(
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      The sensors' view: rays, and the target's distance and bearing.
+      Ray lengths, reflectances, and distances and bearings of the targets.
     """
     shades = electronics.reflectance(factors)
     ray, geom = rays.cast_rays(judge.scene, data, pose, obstacle, factors.infrared_yaw)

@@ -1,7 +1,7 @@
-"""Judges policies on the training device and in the training engine, many arenas at once.
+"""Evaluates policies on the training device and in the training engine, many arenas at once.
 
-Levels, rules and figures are those of the other engine. This one is the training engine, with its
-analytic sensors and few solver steps. Published results come from MuJoCo C; this engine is cheap.
+Levels, rules and metrics are those of `engine_c.py`. Sensors and solver are those of training.
+Published results come from MuJoCo C; this engine is faster.
 """
 
 import functools
@@ -35,7 +35,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.task.world import World
 from swarmjax.training import rollout
 
-_ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
+_ABOUT = ("policy", "activation", "observation", "action")  # keys of `meta` that shape a program
 _WEIGHTS = ("layers", "log_std", "mean", "std", "memory")
 
 
@@ -45,10 +45,10 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
     Args:
       config: settings of the evaluation.
       half: [M, 2] half edges of the boxes in the levels, m.
-      arenas: number of levels that are judged together.
+      arenas: number of levels that are simulated together.
 
     Returns:
-      The world, still without a policy's limits and encoding.
+      The world; `_program` sets the policy's speed limits and encoding.
 
     Raises:
       ConfigError: a box is larger than a stage allows.
@@ -78,14 +78,14 @@ def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
 def play(
     world: World, levels: Level, trained: Policy, steps: int, *, sampled: bool = True
 ) -> Outcome:
-    """Runs an episode of each level with the policy of a file.
+    """Runs an episode of each level with a policy.
 
     Args:
       world: result of `load`.
       levels: [E] with all robots and obstacles of the world.
       trained: the policy.
       steps: control steps of an episode.
-      sampled: whether to draw the actions from the policy; otherwise they are its means.
+      sampled: whether to sample the actions from the policy; otherwise they are its means.
 
     Returns:
       [E] outcomes, as NumPy arrays.
@@ -102,7 +102,7 @@ def play(
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down: some "
-            f"positions are not finite; give a sim.substeps of more than {world.physics.substeps}."
+            f"positions are not finite; give substeps of more than {world.physics.substeps}."
         )
     return Outcome(*map(np.asarray, outcome))
 
@@ -117,7 +117,7 @@ def _program(
       world: result of `load`.
       steps: control steps of an episode.
       about: JSON of what a policy's description says under the keys `_ABOUT`.
-      sampled: whether to draw the actions.
+      sampled: whether to sample the actions.
       module: Flax module of an extension's network; None if there is none.
     """
     meta = json.loads(about)
@@ -146,7 +146,7 @@ def _program(
         trained = bare._replace(**weights, network=network)
 
         def act(memory: Any, arenas: EnvState) -> tuple[Any, Array]:
-            """Draws the actions [E, R, U] with the judge's random numbers, or takes the means."""
+            """Samples the actions [E, R, U] with the judge's random numbers, or takes the means."""
             shape = (arenas.observation.shape[-2], len(meta["action"]["names"]))
             seed, clock = arenas.level.seed, arenas.clock
             normal = noise.normal(seed, clock, Stream.ACTION, shape, jnp) if sampled else 0.0
@@ -175,8 +175,8 @@ def run(
       memory: memory at the start.
 
     Returns:
-      The final arenas, the outcomes, and whether the physics of each arena broke. Such an episode
-      ends, and its robots stay where they were before the step.
+      The final arenas, the outcomes, and whether the physics of each arena broke down. Such an
+      episode ends, and its robots stay where they were before the step.
     """
     robots, obstacles = world.spacing.robots, world.spacing.obstacles
     chex.assert_shape(levels.present, (None, robots))
@@ -220,7 +220,7 @@ def _step(
 
 
 def _events(world: World, before: EnvState, after: EnvState, came: env.TimeStep) -> measures.Events:
-    """Returns the events of a control step; training has counted contacts and infrared."""
+    """Returns the events of a control step, partly from the counters of `env.step`."""
     poses = jax.vmap(partial(physics.poses, world.physics))
     return measures.Events(
         start=poses(before.sim)[..., :2],

@@ -1,4 +1,4 @@
-"""Judges policies on the levels of a suite or a stage, and summarises the outcome."""
+"""Evaluates policies on the levels of a suite or a stage, and summarises the outcome."""
 
 import os
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def evaluate(
     progress: Progress | None = None,
     announce: Callable[[], object] = lambda: None,
 ) -> Evaluation:
-    """Judges policies of one recipe, or of two recipes to compare.
+    """Evaluates policies of one recipe, or of two recipes to compare.
 
     Args:
       settings: Settings of the evaluation.
@@ -47,8 +47,8 @@ def evaluate(
       The results.
 
     Raises:
-      PolicyError: A policy is unsound, or does not fit the levels.
-      ConfigError: A file is missing, a suite is unsound, or the physics breaks down.
+      PolicyError: A policy is invalid, or does not fit the levels.
+      ConfigError: A file is missing, a suite is invalid, or the physics breaks down.
     """
     sides = _read(settings) if entrants is None else [entrants]
     every = [each for side in sides for each in side]

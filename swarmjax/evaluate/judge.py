@@ -39,18 +39,18 @@ class Judge:
 
     Attributes:
       config: Settings of the evaluation.
-      policy: The policy that drives.
+      policy: The policy to evaluate.
       stage: Stage of the levels, with scalar fields [].
       spacing: Sizes for drawing levels.
       drive: The robot's drive, with the range of commands that the policy was trained for.
-      electronics: The electronics between policy and world, with the observations of the policy's
-        training.
+      electronics: The electronics between policy and world, with the observations that the policy
+        was trained with.
       goal: What the robots are asked to do.
       model: The compiled arena.
       ids: Rows of the model's moving bodies.
       scene: The scene for infrared rays.
-      geom_robot: For each geom, the robot whose contact geom it is, else -1.
-      geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
+      geom_robot: For each geom, the index of the robot whose contact geom it is, else -1.
+      geom_kind: For each geom, the index in `gaps.KINDS` of a contact with it.
       substeps: Physics steps of a control step.
       own: Function that computes the extension's observations [A, R, E] from a view [A]; None if
         there are none.
@@ -73,19 +73,19 @@ class Judge:
 
 
 def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None) -> Judge:
-    """Compiles the arena of a stage, with exactly its robots and obstacles.
+    """Compiles the arena of a stage, with as many robots and obstacles as the stage has.
 
     Args:
       config: Settings of the evaluation.
       trained: The policy to judge.
-      half: [M, 2] half edges of the boxes in the coming levels, m. None means those of the
+      half: [M, 2] half edges of the boxes in the levels to run, m. None means those of the
         stage's first level.
 
     Returns:
       The judge.
 
     Raises:
-      PolicyError: The policy has other observations, or too few learners.
+      PolicyError: The policy has other observations, or networks for too few robots.
     """
     check_policy(config, config.stage, config.policy, trained)
     extensions = extension.load(config.extensions)
@@ -128,7 +128,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
 
 def substeps(config: EvaluateConfig) -> int:
-    """Returns the physics steps of a control step; by default each is half as long as in training.
+    """Returns the physics steps of a control step: on wheels, by default twice those of training.
 
     When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts separate sliding
     surfaces, as all convex contacts do. The wheels hop by 1.3 mm with physics steps of 16 ms, and
@@ -146,9 +146,9 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
     robot = task_factors.largest(config.robot, config.realism)
     spec = sim_model.build(robot, size, timestep, ray_geoms=True)
     spec.option.iterations = SOLVER_ITERATIONS
-    # If numbers are not finite, MuJoCo would silently reset the robots to their first places.
+    # If numbers are not finite, MuJoCo would silently reset the robots to the model's own places.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # The half edges are compiled in, not set later, so that MuJoCo derives its bounds from them.
+    # The half edges are set before compiling, so that MuJoCo derives its bounds from them.
     for i, edges in enumerate(half):
         spec.geom(f"obstacle{i}_box").size[:2] = edges
     compiled = spec.compile()
@@ -156,7 +156,7 @@ def _compile(config: EvaluateConfig, half: np.ndarray) -> tuple[mujoco.MjModel, 
 
 
 def _geoms(compiled: mujoco.MjModel, ids: sim_model.Ids) -> tuple[np.ndarray, np.ndarray]:
-    """Returns for each geom the robot whose contact geom it is, if any, and the kind of contact."""
+    """Returns `Judge.geom_robot` and `Judge.geom_kind`."""
     robot = np.full(compiled.ngeom, -1)
     kind = np.full(compiled.ngeom, gaps.KINDS.index("wall"))
     kind[ids.obstacle_geom] = gaps.KINDS.index("obstacle")
@@ -173,7 +173,7 @@ def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation,
 
 
 def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
-    """Makes the goal; that of an extension runs with JAX."""
+    """Makes the goal; a goal of an extension runs with JAX."""
     goal = task_goals.load(config.task, config.robot, extensions.goals)
     own = [piece for piece in extensions.goals if piece.name == config.task.goal]
     if not own:
@@ -183,14 +183,14 @@ def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
     taken = sorted({*goal.measures} & {*MEASURES})
     if taken:
         raise ConfigError(
-            f"goal {config.task.goal} must rename {', '.join(taken)}, which every goal measures."
+            f"goal {config.task.goal} measures {', '.join(taken)}, which are built in: rename them."
         )
     own_goals.check(own[0], goal, config.robot, config.stage.robots, config.stage.obstacles)
     return own_goals.SideBySide(goal)
 
 
 def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | None:
-    """Compiles observations of an extension, for arenas side by side."""
+    """Compiles observations of an extension for many arenas at once."""
     if not own:
         return None
     import jax  # only for extensions
@@ -213,7 +213,7 @@ def check_policy(
       trained: The policy.
 
     Raises:
-      PolicyError: The policy has other observations, or too few learners.
+      PolicyError: The policy has other observations, or networks for too few robots.
       ConfigError: The policy needs a part of an extension that is missing.
     """
     extensions, needs = extension.load(config.extensions), trained.meta.get("extensions", {})
@@ -269,7 +269,7 @@ def draw_level(
       spacing: Sizes.
       seed: Seed of the evaluation.
       episode: Number of the episode.
-      drawings: An extension's ways of drawing levels, in the order of `stage.drawing`.
+      drawings: Level drawings of an extension, in the order that `stage.drawing` counts.
 
     Returns:
       The level, as NumPy arrays.

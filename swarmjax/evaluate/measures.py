@@ -1,4 +1,4 @@
-"""The outcome of episodes, and the figures for comparing policies. No JAX.
+"""The outcome of episodes, and the measures for comparing policies. No JAX.
 
 Every measure is one number per level; docs/evaluation.md gives its formula. The engines pass the
 events of each control step to `tally`, and nothing here depends on the engine.
@@ -12,11 +12,11 @@ import numpy as np
 from swarmjax.sim import gaps
 from swarmjax.task.goals.goal import Measure
 
-# A robot is in a deadlock if, at the time-out, it has not arrived and does not move (Grover, Liu &
-# Sycara 2020, "Deadlock Analysis and Resolution in Multi-Robot Systems"). It does not move if it is
-# within STILL_RADIUS of the place where it was STILL_TIME earlier. The authors require speed 0, but
-# a robot that turns on the spot or pushes never has exactly that speed. Both numbers are this
-# project's choice: at full speed a robot drives 0.63 m in STILL_TIME.
+# A robot is in a deadlock if, when the time is out, it has not arrived and does not move (Grover,
+# Liu & Sycara 2020, "Deadlock Analysis and Resolution in Multi-Robot Systems"). It does not move if
+# it has stayed within STILL_RADIUS of one place for STILL_TIME. The authors require speed 0, but a
+# robot that turns on the spot or pushes never has exactly that speed. This project chose both
+# numbers: at full speed a robot drives 0.63 m in STILL_TIME.
 STILL_RADIUS = 0.02  # m
 STILL_TIME = 5.0  # s
 
@@ -29,16 +29,16 @@ class Outcome(NamedTuple):
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         within its target.
       arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
-        control steps until it was within its target and stayed there.
+        control steps until it came to its target for the last time.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
-      touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
+      touched: [A, R, 3] control steps that ended with the robot in contact, also after arrival.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.
       moving: [A, R] control steps before arrival; with `hold`, control steps that began outside the
         target.
       path: [A, R] distance driven before arrival, m; with `hold`, in the steps of `moving`.
-      still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of one
-        place; 0 if it has arrived.
-      anchor: [A, R, 2] that place, m.
+      still: [A, R] for how many control steps the robot has now stayed within STILL_RADIUS of
+        `anchor`; 0 if it has arrived.
+      anchor: [A, R, 2] the place where the robot last began to stand still, m.
       measured: [A, K] the goal's own measures.
     """
 
@@ -60,13 +60,13 @@ class Events(NamedTuple):
 
     Attributes:
       start: [A, R, 2] places of the robots before the step, m.
-      place: [A, R, 2] places after it, m.
+      place: [A, R, 2] places of the robots after the step, m.
       arrived: [A, R] whether a robot has arrived after the step.
-      begins: [A, R, 3] whether a contact begins, by kind.
+      begins: [A, R, 3] whether a contact of each kind begins.
       touches: [A, R, 3] whether the robot touches something at the end of the step.
       sensed: [A, R] whether an infrared ray met something in range.
       under_way: [A, R] whether the robot had something to do when the step began.
-      rests: [A, R] whether it has nothing to do after the step.
+      rests: [A, R] whether the robot has nothing to do after the step.
       measured: [A, K] the goal's own measures.
     """
 
@@ -82,7 +82,7 @@ class Events(NamedTuple):
 
 
 def begin(place: Any, xp: Any, own: int = 0) -> Outcome:
-    """Returns the outcome of episodes that have just begun.
+    """Returns the initial, empty outcome of episodes.
 
     Args:
       place: [A, R, 2] starts of the robots, m.
@@ -134,7 +134,7 @@ def tally(before: Outcome, step: Events, xp: Any) -> Outcome:
 
 
 def _by_kind(name: str, label: str, unit: str) -> dict[str, Measure]:
-    """Makes a measure over all kinds of contact, and one for each kind."""
+    """Makes one measure for contacts of all kinds together, and one for each kind."""
     kinds = {f"{name}_{kind}": Measure(f"  with {kind}", unit) for kind in gaps.KINDS}
     return {f"{name}_per_robot": Measure(label, unit), **kinds}
 
@@ -166,13 +166,13 @@ def per_level(
       outcome: Outcome of finished episodes.
       control_step: Length of a control step, s.
       steps: Control steps until the time is out.
-      shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
-        Without `shortest` there is no path efficiency.
+      shortest: [A, R] length of the shortest path from start to target, m; inf if there is none.
+        None leaves out path efficiency.
       own: Names of the goal's own measures.
 
     Returns:
-      An array [A] for each of the `MEASURES` that can be computed, in the same order, and then for
-      the goal's own.
+      An array [A] for each of the `MEASURES` that can be computed, in their order, and then for
+      each of the goal's own measures.
     """
     late = ~outcome.arrived
     arrival = np.where(late, steps, outcome.arrival) * control_step
@@ -205,7 +205,7 @@ def _efficiency(outcome: Outcome, shortest: np.ndarray) -> np.ndarray:
     """Computes success weighted by path length for each robot, [A, R], 0 to 1.
 
     Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents", equation 1: success times
-    shortest / max(driven, shortest). A way of length 0 counts as driven perfectly.
+    shortest / max(driven, shortest). A path of length 0 counts as driven perfectly.
     """
     longer = np.maximum(outcome.path, shortest)
     known = np.isfinite(longer)

@@ -42,10 +42,10 @@ def cast_rays(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Casts the infrared sensors' rays with MuJoCo.
 
-    A ray that starts inside something reads 0. For such a ray MuJoCo reports the place where the
-    ray leaves that thing, at a face whose normal points along the ray. So each sensor casts two
-    rays, ahead and back, and is inside something if either ray leaves something. Pushing robots
-    overlap a little, so a single ray may enter a second thing before it leaves the first.
+    A ray that starts inside an object reads 0. For such a ray MuJoCo reports where the ray leaves
+    the object, at a face whose normal points along the ray. So each sensor casts two rays, ahead
+    and back, and is inside an object if either ray leaves one. Pushing robots overlap a little, so
+    a single ray may enter a second object before it leaves the first.
 
     Args:
       scene: The scene.
@@ -55,8 +55,8 @@ def cast_rays(
       yaw: [A, R, K] by how much each sensor is turned from its nominal yaw, rad.
 
     Returns:
-      [A, R, K] distance from the sensor's origin to the nearest surface, m, from 0 to the reach
-      of the electronics; and the geom that the ray meets, -1 if none.
+      [A, R, K] distance along the ray to the nearest surface, m, at most `scene.reach`; and the
+      geom that the ray meets, -1 if none.
     """
     limit = scene.reach
     origin, direction = infrared.rays(pose, np, infrared.Mount(scene.robot.sensor_poses, yaw))
@@ -82,11 +82,11 @@ def cast_rays(
 
 
 def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) -> np.ndarray:
-    """Returns the brightness of the geoms that rays meet.
+    """Returns the reflectance of the geoms that rays meet.
 
     Args:
       scene: The scene.
-      shades: Reflectance of things, [A, ...].
+      shades: Reflectances of walls, obstacles and robots, [A, ...].
       geom: [A, R, K] from `cast_rays`.
 
     Returns:
@@ -106,10 +106,10 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
 def _near(
     scene: RayScene, middle: np.ndarray, place: np.ndarray, obstacle: np.ndarray
 ) -> np.ndarray:
-    """Tells which rays [A, R, K] may meet anything, by comparing circles around rays and things.
+    """Finds which rays [A, R, K] may meet an object, by comparing circles around rays and objects.
 
-    Casting rays is the slowest part, and most rays meet nothing. For the walls, the stage's
-    smallest arena is assumed.
+    Casting rays is the slowest part, and most rays meet nothing. The walls are taken to be those of
+    the stage's smallest arena.
 
     Args:
       scene: The scene.
@@ -118,7 +118,7 @@ def _near(
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
 
     Returns:
-      [A, R, K].
+      [A, R, K] bool.
     """
     robots = _apart_from_robots(scene, middle, place) - scene.robot.hull_radius
     boxes = _apart(middle, obstacle[..., :2])

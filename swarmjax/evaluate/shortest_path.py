@@ -1,8 +1,8 @@
-"""Shortest paths of a robot's disc past obstacles, the reference for path efficiency.
+"""Shortest paths of a disc-shaped robot past obstacles, the reference for path efficiency.
 
 If the straight line is free and ends inside the walls, it is the path. Otherwise the path follows
 the outlines of obstacles, widened by the disc's radius. `CORNER` points outside each round corner
-replace the arc. They lengthen a path by at most 0.8 mm for each right angle that the path turns
+replace its arc. They lengthen a path by at most 0.8 mm for each right angle that the path turns
 (tan(x) / x - 1 = 1.3 % of a quarter circle of 0.037 m, x = 11.25 degrees). NumPy only.
 """
 
@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 CORNER = 4  # points for each round corner
-GOAL = 24  # points on the circle around a target, used if the straight way to its centre is blocked
-_DETOUR = 0.2  # m; length by which a way is first allowed to exceed the straight line
+GOAL = 24  # points on the circle around a target, used if the straight line to it is blocked
+_DETOUR = 0.2  # m; in the first search, a path may exceed the straight line by this length
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 
@@ -69,7 +69,7 @@ def shortest(
     hull_radius: float,
     target_radius: float,
 ) -> np.ndarray:
-    """Finds the lengths of the shortest paths of robots, each alone in its arena.
+    """Finds the lengths of the shortest paths of robots, without other robots in the way.
 
     Args:
       side: [A] sides of the square arenas, m.
@@ -109,8 +109,8 @@ def _near_way(
 ) -> float:
     """Computes the length of the shortest path of one robot past obstacles [M, 5], m.
 
-    A path stays within an ellipse around its ends. If the shortest path past the obstacles in an
-    ellipse is short enough to stay in it, it meets no others.
+    A path of a given length stays within an ellipse around its ends. So if the shortest path past
+    the obstacles in an ellipse is short enough to stay in it, it meets no other obstacles.
     """
     apart = [np.linalg.norm(obstacle[:, :2] - end, axis=-1) for end in (start, target)]
     least = apart[0] + apart[1] - 2.0 * (np.hypot(*obstacle[:, 3:].T) + hull)
@@ -133,8 +133,8 @@ def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> 
     """Computes the length of the shortest path of one robot, m; inf if there is none.
 
     This is A* on the visibility graph (Hart, Nilsson & Raphael 1968, "A formal basis for the
-    heuristic determination of minimum cost paths"). A line is tested when the search comes to its
-    beginning, and only if it could be part of a shortest path.
+    heuristic determination of minimum cost paths"). The search tests whether a line is free when it
+    comes to the line's beginning, and only if the line could be part of a shortest path.
     """
     boxes, inside = arena.boxes, arena.inside
     circle = _clear(_circle(target, reach, inside), boxes, inside)
@@ -174,7 +174,7 @@ def _circle(target: np.ndarray, reach: float, inside: float) -> np.ndarray:
 
 
 def _are_free(boxes: _Boxes, one: _Points, others: _Points) -> np.ndarray:
-    """Tells for each straight line [L] from one point to others whether no box blocks it."""
+    """Returns for each straight line [L] from one point to others whether it is free of boxes."""
     line, box = np.nonzero((one.beyond & others.beyond) == 0)
     start = one.local[:, 0, box]
     way = others.local[:, line, box] - start
@@ -215,22 +215,21 @@ def _take(points: _Points, rows: np.ndarray | list[int]) -> _Points:
 
 
 def _within(points: np.ndarray, inside: float | np.ndarray) -> np.ndarray:
-    """Tells whether points [..., 2] lie in the square of half edge `inside`, [...]."""
+    """Returns whether points [..., 2] lie in the square of half edge `inside`, [...]."""
     return np.abs(points).max(axis=-1) <= inside + _SLACK
 
 
 def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float) -> np.ndarray:
-    """Tells whether boxes [..., 5] block a disc's straight ways between points [..., 2], [...]."""
+    """Returns whether boxes [..., 5] block a disc on straight lines between points [..., 2]."""
     start, way = _into(first - box[..., :2], box), _into(second - first, box)
     return _meets(start, way, np.moveaxis(box[..., 3:], -1, 0), hull - _SLACK)
 
 
 def _meets(start: np.ndarray, way: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Tells whether lines from `start` along `way` [2, ...] come within a radius of boxes at 0.
+    """Returns whether lines from `start` along `way` [2, ...] come within a radius of boxes at 0.
 
-    A line does so if it enters the box, with half edges [2, ...], after the box is widened by the
-    radius. That shape consists of two boxes, each longer by the radius at both ends of one axis,
-    and a circle around each corner.
+    Widened by the radius, a box with half edges [2, ...] consists of two boxes, each longer by the
+    radius at both ends of one axis, and a circle around each corner.
     """
     wide = half[:, None] + radius * np.eye(2).reshape(2, 2, *[1] * (half.ndim - 1))
     pace = np.where(np.abs(way) < 1e-12, 1e-12, way)[:, None]

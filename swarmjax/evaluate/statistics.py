@@ -1,12 +1,12 @@
 """Point estimates and their intervals, with NumPy alone.
 
-Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
+Evaluation, benchmarks and studies compute their reported numbers here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
 4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]. A run is a
 training seed, and a task is a level or a stage on which the run's policy was judged.
 
-A bootstrap draws with replacement the part of the data that its interval is about, and takes the
-rest as given. The right draw depends on how the values were produced:
+A bootstrap draws with replacement the part of the data to which its interval generalises, and keeps
+the rest fixed. Which part to draw depends on how the values were produced:
 
 =================  ==========================================  ==================================
 draw               each resample                               the interval is about
@@ -21,13 +21,13 @@ draw               each resample                               the interval is a
 
 Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
 the same levels, a hard level is hard for all of them, and drawing levels for each run would average
-this difficulty out. The last draw errs on the wide side, because it counts the spread of single
-values twice (Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
+this difficulty out. Intervals of `runs_and_tasks` are too wide, because they count the spread of
+single values twice (Owen 2007, "The pigeonhole bootstrap"). With many tasks the error is small.
 
-Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
-than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
-resamples are inf. No function here turns inf into nan: calls in which inf would become nan are
-refused. Values of nan and -inf are refused too.
+Values may be inf, for example the steps to a threshold that was never reached. Inf is larger than
+every number. A mean that includes inf is inf, and an end of an interval is inf if too many
+resamples are inf. The functions refuse values of nan and -inf, and calls in which inf would become
+nan.
 """
 
 import math
@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
-# With two runs, half of all resamples hold one run twice, so the interval would just span both.
+# With two runs, half of all resamples hold one run twice, so the interval would span both runs.
 LEAST_DRAWN = 3
 CONFIDENCE = 0.95  # of every interval
 RESAMPLES = 2000
@@ -65,8 +65,8 @@ class Interval[T](NamedTuple):
 def iqm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> np.float64 | np.ndarray:
     """Computes the interquartile mean: the mean without the lowest and highest quarter of values.
 
-    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. So three
-    values or fewer are not trimmed. In rliable this mean is called the IQM.
+    A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. So of three
+    values or fewer, none is left out. The library rliable calls this mean the IQM.
 
     Args:
       x: [...] values in any unit; if more than a quarter of them are inf, the result is inf.
@@ -95,8 +95,8 @@ def cvar(
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
     It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
-    rounded up to whole values, so it is never empty. If each level was tried only once, the result
-    is worse than a result from the levels' expected values, because it also reflects chance.
+    rounded up to whole values, so it is never empty. If each level was tried only once, the worst
+    results include bad luck.
 
     Args:
       x: [...] of any unit.
@@ -133,15 +133,15 @@ def bootstrap(
 
     `draw` names the part that is drawn with replacement; see the table at the top of the module.
 
-    With few runs the interval is too narrow: an interval of 95 % for the mean of 3, 5 or 10 normal
-    values holds the truth in 75, 84 or 90 % of cases. The ends of the interval are statistics of
-    resamples. If a percentile falls between two resamples, the outer one is used.
+    With few runs the interval is too narrow: a 95 % interval for the mean of 3, 5 or 10 normal
+    values contains the true mean in 75, 84 or 90 % of cases. If a percentile falls between the
+    statistics of two resamples, the interval ends at the outer one.
 
     Args:
       values: [runs, tasks] values in any unit; at least three runs if runs are drawn, and at least
         three tasks if tasks are drawn.
       statistic: called as `statistic(x, axis=(-2, -1))` on x [..., runs, tasks].
-      draw: the part to draw, and therefore what the interval is about.
+      draw: the part to draw, to which the interval generalises.
       strata: sizes of groups of consecutive tasks; tasks are drawn within each group (Efron &
         Tibshirani 1993, section 8.3). None draws among all tasks.
       resamples: number of resamples; 40 or more, so that one lies beyond each end of the interval.
@@ -150,7 +150,7 @@ def bootstrap(
       Estimate and interval, in the unit of the statistic.
 
     Raises:
-      ValueError: the values are refused.
+      ValueError: the values are empty, too few, or hold nan or -inf.
     """
     table = _table("values", values, draw)
     how = _How(draw, strata, resamples, table.size)
@@ -168,8 +168,8 @@ def paired(
 ) -> Interval[float]:
     """Computes the interval of a difference: the statistic of b minus the statistic of a.
 
-    Both are resampled with the same draws, so that shared influences (a level, a policy) cancel in
-    the difference. Values at the same place form a pair.
+    Both are resampled with the same draws, so that influences of a level or a seed on both cancel
+    in the difference. Values at the same place form a pair.
 
     Args:
       a: [runs, tasks] of any unit, finite.
@@ -212,7 +212,7 @@ def probability_of_improvement(
     """Computes the interval of the probability that a beats b: P(a > b) + P(a = b) / 2.
 
     The probability is averaged over tasks. On each task the probability is U / (n m) of the
-    Mann-Whitney test, as in Agarwal et al. 2021, section 4.3. The runs of a and b are resampled
+    Mann-Whitney test, as in Agarwal et al. 2021, section 4.3. Runs of a and runs of b are drawn
     independently; drawn tasks are the same for both. Only the order of values matters, so inf is a
     value like any other. If small values are good, exchange a and b.
 
@@ -228,7 +228,7 @@ def probability_of_improvement(
       Probability and interval, 0 to 1.
 
     Raises:
-      ValueError: as in `bootstrap`, and if tasks differ in number.
+      ValueError: as in `bootstrap`, and if a and b have different numbers of tasks.
     """
     ours, theirs = _table("a", a, draw), _table("b", b, draw)
     if ours.shape[1] != theirs.shape[1]:
@@ -284,7 +284,7 @@ def checked(name: str, x: ArrayLike) -> np.ndarray:
 
 
 def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
-    """Converts numbers, and merges the axes to reduce into a last one."""
+    """Converts numbers to double precision, and merges the axes to reduce into one last axis."""
     values = checked("x", x)
     if axis is None:
         return values.ravel()
@@ -294,7 +294,7 @@ def _flat(x: ArrayLike, axis: int | tuple[int, ...] | None) -> np.ndarray:
 
 
 def _table(name: str, x: ArrayLike, draw: str) -> np.ndarray:
-    """Converts numbers [runs, tasks]; refuses too few runs or tasks to draw from."""
+    """Converts numbers [runs, tasks] to double precision; refuses too few to draw from."""
     values = checked(name, x)
     if values.ndim != 2:
         raise ValueError(f"{name} has shape {values.shape}: give an array of shape [runs, tasks].")
@@ -311,7 +311,7 @@ type _Index = tuple[np.ndarray, np.ndarray]
 
 
 class _How(NamedTuple):
-    """How values [runs, tasks] are drawn: arguments of `bootstrap`, and values a resample."""
+    """How values [runs, tasks] are drawn; `size` is the number of values in a resample."""
 
     draw: Draw
     strata: Sequence[int] | None
@@ -340,10 +340,10 @@ def _all(shape: tuple[int, ...]) -> _Index:
 def _resampled(
     compute: Callable[..., np.ndarray], how: _How, *shapes: tuple[int, ...]
 ) -> Interval[float]:
-    """Computes the percentile interval of a figure of tables with these shapes.
+    """Computes the percentile interval of a statistic of tables with these shapes.
 
-    The interval's ends are draws, never mixtures of two draws, because a mixture of inf and inf
-    would be nan.
+    The interval's ends are the statistics of resamples, never interpolated between two of them,
+    because interpolating between inf and inf would give nan.
     """
     random, draws = np.random.default_rng(0), []
     block = max(1, BLOCK // how.size)  # resamples that fit the memory

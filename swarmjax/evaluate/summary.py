@@ -1,4 +1,4 @@
-"""Summarises an evaluation: means, interquartile means, worst levels, each with its interval."""
+"""Summarises an evaluation: means, interquartile means and worst levels, with intervals."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,9 +31,9 @@ def result(
 
     Args:
       config: Settings of the evaluation.
-      suite: Its name, or None.
+      suite: Name of the suite, or None.
       sides: Policies of one recipe, or of two recipes to compare, equally many of each.
-      trials: Their results, one for each cell, with the rows of the first side first.
+      trials: The policies' results, one for each cell, with the rows of the first side first.
 
     Returns:
       The result; docs/interface.md lists it.
@@ -60,7 +60,7 @@ def result(
 def _figures(
     trials: Sequence[Trial], strata: Sequence[int] | None = None, *, is_one: bool
 ) -> dict[str, dict[str, Any]]:
-    """Summarises cells together, or compares the two halves of their policies."""
+    """Summarises cells together, or compares the first half of their policies with the second."""
     measured = {
         name: np.concatenate([trial.measures[name] for trial in trials], axis=1)
         for name in trials[0].measures
@@ -74,11 +74,11 @@ def _figures(
 
 
 def about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
-    """Describes under which settings an evaluation runs, as plain data for JSON.
+    """Describes the settings of an evaluation, as plain data for JSON.
 
     Args:
       config: Settings of the evaluation.
-      suite: Its name, or None.
+      suite: Name of the suite, or None.
     """
     return {
         "suite": suite,
@@ -93,7 +93,7 @@ def about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
 
 
 def about_cell(config: EvaluateConfig, cell: Cell) -> dict[str, Any]:
-    """Describes the levels of a cell, and the settings that it has for itself.
+    """Describes the levels of a cell, and the settings with which it is evaluated.
 
     Args:
       config: Settings of the evaluation.
@@ -152,22 +152,19 @@ def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) 
 
 
 def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
-    """Tells whether levels [P, E] can be drawn: a group of one level has no spread."""
+    """Returns whether every group of levels is large enough to draw from."""
     return min(strata or [table.shape[1]]) >= LEAST_DRAWN
 
 
 def _draw(table: np.ndarray) -> Draw:
-    """Chooses what to draw.
-
-    All policies have the same levels. If there are few policies, only levels are drawn.
-    """
+    """Chooses what a bootstrap draws: with too few policies, only levels."""
     return "runs_and_tasks" if len(table) >= LEAST_DRAWN else "tasks"
 
 
 def _pool(trials: Sequence[Trial], *, is_one: bool) -> dict[str, Any] | None:
     """Summarises the levels of all cells together.
 
-    Returns None for a single cell, and if cells share levels. Figures of cells that share levels
+    Returns None for a single cell, and if cells share levels. Results of cells that share levels
     are not independent, but the intervals draw the levels of each cell independently.
     """
     cells = [trial.cell for trial in trials]
@@ -178,7 +175,7 @@ def _pool(trials: Sequence[Trial], *, is_one: bool) -> dict[str, Any] | None:
 
 
 def _share(a: Cell, b: Cell) -> bool:
-    """Tells whether cells share a level, even if obstacles' shape and realism differ."""
+    """Returns whether cells share a level; the name of the stage and realism may differ."""
     alike = a.seed == b.seed and replace(a.stage, name=b.stage.name) == b.stage
     return alike and bool(np.isin(a.episodes, b.episodes).any())
 
@@ -193,14 +190,14 @@ def compare(
 
     Args:
       a: Values [P, E] of each measure for the first recipe.
-      b: Values [P, E] for the second recipe, on the same levels; equal rows have equal seeds.
+      b: Values [P, E] for the second recipe, on the same levels and with the same seeds in order.
       strata: As in `summarize`.
       about: As in `summarize`.
 
     Returns:
-      For each measure that both have, the means `a` and `b`; `difference`, b - a of the means; and
-      `improvement`, the probability that b is better on a level. Each of the last two has an
-      interval, under its name with `_interval` appended.
+      For each measure that both have, the means `a` and `b`, their `difference` b - a, and
+      `improvement`, the probability that b is better on a level. The last two have intervals, under
+      their names with `_interval` appended.
     """
     return {name: _comparison(about[name], a[name], b[name], strata) for name in a if name in b}
 

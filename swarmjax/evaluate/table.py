@@ -1,4 +1,4 @@
-"""Tables of an evaluation, for a terminal and, level by level, as CSV."""
+"""Shows an evaluation as tables on a terminal, and lists its levels as CSV."""
 
 import csv
 import io
@@ -29,18 +29,18 @@ _COLUMNS = (
 
 
 def console() -> Console:
-    """Returns a console for standard output, without lines that are too long."""
+    """Returns a console for standard output, at most `words.WIDTH` letters wide."""
     found = Console()
     found.width = min(found.width, words.WIDTH) if found.is_terminal else words.WIDTH
     return found
 
 
 def show(console: Console, result: Mapping[str, Any]) -> None:
-    """Prints a result; without styles unless the output is a terminal.
+    """Prints a result.
 
     Args:
       console: Console to print on.
-      result: Result of `summary`, for policies or for a comparison.
+      result: Return value of `summary.result`.
     """
     cells = result["cells"]
     sides = result.get("compared", [result.get("policies")])
@@ -74,7 +74,7 @@ def _names(side: Sequence[Mapping[str, str]]) -> str:
 
 
 def make_table(console: Console, *heads: str) -> Table:
-    """Makes a table without rows; a long name in its first column is broken, but no number."""
+    """Makes a table without rows; only its first column may be broken into lines."""
     form, left = box.SIMPLE if console.is_terminal else None, int(len(heads) < 9)
     table = Table(box=form, padding=(0, 1, 0, left))
     for i, head in enumerate(heads):
@@ -94,7 +94,7 @@ def _show_cell(console: Console, cell: Mapping[str, Any], about: Mapping[str, Me
 
 
 def _show_cells(console: Console, result: Mapping[str, Any]) -> None:
-    """Prints several cells: a row for each, and one for all if they can be pooled."""
+    """Prints several cells: a row for each, and one for all together if they can be pooled."""
     table = make_table(console, "", "levels", *(column[0] for column in _COLUMNS))
     pooled = [] if result["pooled"] is None else [{"cell": "all", **result["pooled"]}]
     for cell in (*result["cells"], *pooled):
@@ -149,7 +149,7 @@ def levels(entrants: Sequence[Entrant], trials: Sequence[Trial]) -> str:
 
     Args:
       entrants: The policies, in the order of the trials' rows.
-      trials: Their results, one for each cell.
+      trials: The policies' results, one for each cell.
     """
     names, text = [*trials[0].measures], io.StringIO()
     rows = csv.writer(text, lineterminator="\n")

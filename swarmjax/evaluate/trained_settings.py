@@ -1,8 +1,8 @@
-"""The robot and the task that a policy was trained with, from its file.
+"""Reads from a policy's file the robot and the task that it was trained with.
 
 Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
-the command line sets them. The judge's body and the friction of hulls do not come from the file. By
-default the body has wheels and hulls rub as in Webots, so that all policies are judged alike.
+the command line sets them. They do not take body and hull friction from the file: by default the
+body has wheels and hulls rub as in Webots, so that all policies are judged alike.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -39,8 +39,8 @@ class Trained(NamedTuple):
     Attributes:
       robot: Settings of the robot.
       task: Settings of the task that a judge needs too.
-      realism: Realism of sensors and bodies.
-      stages: Plain data of the training's stages in order; none if the file names none.
+      realism: Settings of realism.
+      stages: Plain data of the stages of training, in order; empty if the file names none.
     """
 
     robot: RobotConfig
@@ -57,7 +57,7 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
       path: Path of the file.
 
     Raises:
-      ConfigError: A number is unsound.
+      ConfigError: A number is invalid.
     """
     names = {item.name for item in fields(RobotConfig)}
     robot = {key: value for key, value in meta["robot"].items() if key in names}
@@ -93,12 +93,12 @@ def load[C: Section](
         stage.
 
     Returns:
-      The settings, and one line that describes what comes from the policies.
+      The settings, and a line that says what comes from the policies.
 
     Raises:
-      ConfigError: An argument is unsound or not read here, or policies were trained differently and
-        no argument decides.
-      PolicyError: A policy is unsound.
+      ConfigError: An argument is invalid or not read here, or policies were trained with different
+        settings and no argument sets them.
+      PolicyError: A policy is invalid.
     """
     if "task.step_limit" in files.parse(cls, typed):
         raise ConfigError("task.step_limit works only in training: give steps=NUMBER instead.")
@@ -142,7 +142,7 @@ def _words(cls: type[Section], training: Trained, typed: Sequence[str]) -> list[
 def _check_alike(
     cls: type[Section], paths: list[str], words: list[list[str]], typed: Sequence[str]
 ) -> None:
-    """Refuses policies that were trained differently, unless an argument decides."""
+    """Refuses policies that were trained with different settings, unless an argument sets them."""
     given = files.parse(cls, typed)
     for path, mine in zip(paths[1:], words[1:], strict=True):
         for word in sorted(set(mine) ^ set(words[0])):

@@ -1,4 +1,4 @@
-"""Runs every policy on every cell, split over processes or in the training engine."""
+"""Runs every policy on every cell: in MuJoCo C on several processes, or in the training engine."""
 
 import math
 import os
@@ -30,7 +30,7 @@ BATCH = 64  # arenas that share NumPy's cost per call; larger batches gain littl
 
 
 class Entrant(NamedTuple):
-    """A policy to judge, and the path of its file."""
+    """A policy to evaluate, and the path of its file."""
 
     path: str
     policy: Policy
@@ -69,11 +69,11 @@ def read_policies(files: Sequence[str], extensions: str | None = None) -> list[E
     """Reads policy files.
 
     Args:
-      files: Their paths.
+      files: Paths of the files.
       extensions: Value of the key `extensions`.
 
     Raises:
-      PolicyError: A file is unsound.
+      PolicyError: A file is invalid.
     """
     return [Entrant(file, policy_file.read(file, extensions)) for file in files]
 
@@ -84,7 +84,7 @@ def run(
     entrants: Sequence[Entrant],
     report: Callable[[int], None] = lambda _: None,
 ) -> Iterator[Trial]:
-    """Judges policies on cells.
+    """Evaluates policies on cells.
 
     Args:
       config: Settings of the evaluation.
@@ -111,8 +111,8 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage and seed. A cell with a realism sets it too, and a cell with a
-        step limit if `config` has none.
+      cell: Sets the stage and the seed, the realism if the cell has one, and the number of control
+        steps if `config` has none.
 
     Returns:
       The settings.
@@ -136,7 +136,7 @@ def _try(
 ) -> Trial:
     """Builds a trial from the policies' outcomes on a cell."""
     goal = goals.load(config.task, config.robot, extension.load(config.extensions).goals)
-    # The shortest way is that to a target that stays.
+    # Shortest paths lead to targets that do not move.
     known = None if goal.moves else shortest
     shortest = np.zeros_like(shortest) if goal.moves else shortest
     second, steps, own = config.task.control_step, config.step_limit, goal.measures
@@ -151,7 +151,7 @@ def _by_mjx(
     entrants: Sequence[Entrant],
     report: Callable[[int], None],
 ) -> Iterator[_Result]:
-    """Runs each cell at once in the training engine."""
+    """Runs all levels of a cell at once in the training engine."""
     from swarmjax.evaluate import engine_mjx
     from swarmjax.run import compile_cache  # these modules need JAX
 
@@ -206,8 +206,8 @@ def work[Job, Result](
     """Runs jobs in order, and yields their results in the same order.
 
     Args:
-      function: Function of a module, so that other processes find it.
-      jobs: Its arguments.
+      function: Function at the top of a module, so that other processes can import it.
+      jobs: Arguments of the function, one for each call.
       workers: Number of processes; 1 means this process alone.
     """
     if workers <= 1:
@@ -218,7 +218,7 @@ def work[Job, Result](
 
 
 def _begin_worker() -> None:
-    """Prepares a process that judges."""
+    """Prepares a process that runs jobs."""
     # Ctrl-C ends the process at once and silently; its parent prints the message.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -251,7 +251,7 @@ def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:
       levels: [E].
 
     Returns:
-      [E, R] m; inf where there is no path for any robot.
+      [E, R] m; inf where there is no path.
     """
     start, hull, reach = levels.start[..., :2], config.robot.hull_radius, config.task.target_radius
     return shortest_path.shortest(levels.side, start, levels.target, levels.obstacle, hull, reach)

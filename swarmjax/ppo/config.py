@@ -27,7 +27,7 @@ class AlgoConfig(Section):
     """
 
     name: Literal["ppo", "paper"] = setting(
-        "ppo", "preset that gave the first values", derived=True
+        "ppo", "preset that the settings are based on", derived=True
     )
     policy: Literal["shared", "independent"] = setting(
         "shared", "shared: one policy for all robots; independent: one policy for each robot"
@@ -39,7 +39,7 @@ class AlgoConfig(Section):
     memory: Literal["none", "gru"] = setting(
         "none", "memory of the robots; gru: a gated recurrent unit after the hidden layers"
     )
-    memory_size: int = setting(64, "numbers in the memory of each network [memory=gru]", 1, 1024)
+    memory_size: int = setting(64, "size of the memory of each network [memory=gru]", 1, 1024)
     critic: Literal["observation", "state"] = setting(
         "observation",
         "what the critic sees; state: also targets, other robots, walls, the distance to go "
@@ -53,7 +53,7 @@ class AlgoConfig(Section):
         "activation of the mean action; tanh: keeps the action within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
-        "orthogonal", "first weights; uniform: within +-1 / sqrt(inputs), biases too, as in PyTorch"
+        "orthogonal", "initial weights; uniform: weights and biases up to +-1 / sqrt(inputs)"
     )
     normalize_observations: bool = setting(
         True, "normalise observations by running mean and deviation; false: raw; both clip to +-10"
@@ -75,14 +75,14 @@ class AlgoConfig(Section):
     )
     actor_learning_rate: float | None = setting(
         None,
-        "learning rate of the policy: 'optimizer learning rate actor'; null: 3e-4, but in a run of "
-        "more than 15000 gradient steps less, in inverse proportion to their number",
+        "learning rate of the policy: 'optimizer learning rate actor'; null: 3e-4, and less in a "
+        "run of more than 15000 gradient steps, in inverse proportion to their number",
         above=0.0,
         high=1.0,
     )
     critic_learning_rate: float | None = setting(
         None,
-        "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced as the policy's",
+        "rate of the critic: 'optimizer learning rate critic'; null: 1e-3, reduced as the actor's",
         above=0.0,
         high=1.0,
     )

@@ -20,7 +20,7 @@ class ReportConfig(Section):
         "settings, and draws the success of all groups into one figure",
     )
     out: str | None = setting(
-        None, "directory to write; null: a folder report, in run or beside the first of runs"
+        None, "directory to write; null: report, in run or beside the first of runs"
     )
 
     def _check(self) -> None:

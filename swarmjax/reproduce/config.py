@@ -30,8 +30,8 @@ class ReproduceConfig(Section):
     command: ClassVar[str] = "reproduce"
 
     seeds: int = setting(10, "number of seeds of each arm", LEAST_DRAWN, 4096)
-    budget: int = setting(BUDGET, "control steps of a seed; with fewer: no verdicts", UPDATE, _MOST)
-    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded, at 1.5 m", UPDATE, _MOST)
+    budget: int = setting(BUDGET, "control steps of a seed; if fewer, no verdicts", UPDATE, _MOST)
+    fine_tune: int = setting(FINE_TUNE, "as budget, for the arms NAME_expanded", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
         None, "save and stop after so many minutes; resume=DIR continues", above=0.0

@@ -37,7 +37,7 @@ class RobotConfig(Section):
     """Settings of the robot. The defaults are the e-puck's; epuck.py gives their sources."""
 
     body: Literal["planar", "wheeled"] = setting(
-        "planar", "planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"
+        "planar", "planar: a disc with 3 degrees of freedom; wheeled: a free body on two wheels"
     )
     hull_radius: float = setting(
         epuck.HULL_RADIUS,
@@ -56,13 +56,13 @@ class RobotConfig(Section):
     )
     track: float = setting(
         epuck.TRACK,
-        "distance between the wheels for converting commands to wheel speeds, m",
+        "distance between the wheels, used to convert commands to wheel speeds, m",
         LEAST,
         2 * LARGEST_HULL,
     )
     effective_track: float | None = setting(
         None,
-        "distance between the points where the wheels grip, m; null: track",
+        "distance between the points where the wheels grip, m; null: as track",
         LEAST,
         2 * LARGEST_HULL,
     )
@@ -77,7 +77,7 @@ class RobotConfig(Section):
     )
     hull_friction: float = setting(
         0.0,
-        "friction of hulls on hulls, boxes and walls; 0: they slide; Webots has 1",
+        "friction of hulls on hulls, boxes and walls; 0: none; Webots has 1",
         0.0,
         MOST_HULL_FRICTION,
         reason=HULL_FRICTION_REASON,
@@ -90,7 +90,7 @@ class RobotConfig(Section):
         reason=_SPEED_REASON,
     )
     wheel_limit: Literal["refuse", "clip"] = setting(
-        "refuse", "a max_speed beyond the wheels' speed limit: refuse it, or clip what is driven"
+        "refuse", "if the wheels cannot reach max_speed: refuse the settings, or clip the speed"
     )
     max_turn_rate: float = setting(
         epuck.MAX_TURN_RATE,
@@ -107,7 +107,7 @@ class RobotConfig(Section):
     sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
     sensor_height: float = setting(
         epuck.SENSOR_HEIGHT,
-        "height of the infrared sensors, within that of every hull, m",
+        "height of the infrared sensors, between bottom and top of the hull, m",
         above=epuck.HULL_BOTTOM,
         below=epuck.HULL_TOP,
     )
@@ -116,7 +116,7 @@ class RobotConfig(Section):
     )
     sensor_response: tuple[sensors.Point, ...] = setting(
         epuck.INFRARED_TABLE,
-        "ray length (m), value and relative deviation, for realism.infrared=webots",
+        "table of ray length (m), sensor count and relative SD, for realism.infrared=webots",
         0.0,
         sensors.MOST_VALUE,
     )
@@ -180,21 +180,21 @@ class SimConfig(Section):
     """Settings of the compiled simulation."""
 
     impl: Literal["auto", "jax", "warp"] = setting(
-        "auto", "physics implementation; auto: warp on an NVIDIA GPU"
+        "auto", "physics implementation; auto: warp on an NVIDIA GPU, else jax"
     )
     solver: Literal["auto", "mjx", "swarm"] = setting(
         "auto",
-        "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
-        "body, on wheels only with impl=warp; auto: swarm where available",
+        "contact solver; mjx: MJX's own, unpatched; swarm: swarmjax's own, for wheeled "
+        "robots only with impl=warp; auto: swarm where available",
     )
     max_robots: int | None = setting(
-        None, "robots to compile for; null: 5, or as many as the stages need", 1, 1024
+        None, "robots to compile for; null: as many as the stages need, at least 5", 1, 1024
     )
     max_obstacles: int | None = setting(
         None, "obstacles to compile for; null: as many as the stages need, at least 4", 0, 256
     )
     substeps: int | None = setting(
-        None, "physics steps per control step; null: the body's default", 1, 1000
+        None, "physics steps per control step; null: 1 for planar, 2 for wheeled", 1, 1000
     )
 
     @property

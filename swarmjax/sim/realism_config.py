@@ -35,16 +35,16 @@ class RealismConfig(Section):
         "ideal", "preset that the settings are based on", derived=True
     )
     infrared: Literal["ideal", "webots", "real"] = setting(
-        "ideal", "sensor model: exact distance, Webots' table, or fitted to real robots"
+        "ideal", "sensor model: exact distance, Webots' table, or a fit to real robots"
     )
     infrared_noise: tuple[float, float] | None = setting(
-        None, "factor on the model's own noise; per sensor and episode", 0.0, 1000.0
+        None, "factor on the sensor model's noise; per sensor and episode", 0.0, 1000.0
     )
     infrared_gain: tuple[float, float] | None = setting(
-        None, "factor on reflected counts; per sensor and episode", above=0.0, high=10.0
+        None, "factor on counts from reflection; per sensor and episode", above=0.0, high=10.0
     )
     infrared_yaw: float | None = setting(
-        None, "SD of the yaw, rad; per sensor and episode", 0.0, math.pi
+        None, "SD of the sensor's yaw error, rad; per sensor and episode", 0.0, math.pi
     )
     infrared_period: tuple[float, float] | None = setting(
         None,
@@ -54,7 +54,7 @@ class RealismConfig(Section):
     )
     reflectance: tuple[float, float] | None = setting(
         None,
-        "reflectance of each obstacle, and of all walls; per episode; null: 1",
+        "reflectance of each obstacle, and one for all walls; per episode; null: 1",
         above=0.0,
         high=1.0,
     )
@@ -68,7 +68,7 @@ class RealismConfig(Section):
         None, "radius of the wheels, m; per robot and episode", LEAST, below=0.03
     )
     track: tuple[float, float] | None = setting(
-        None, "effective track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
+        None, "as robot.effective_track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
     )
     max_wheel_speed: tuple[float, float] | None = setting(
         None, "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL
@@ -104,10 +104,10 @@ class RealismConfig(Section):
         reason=_LATENCY_REASON,
     )
     target_distance_noise: float | None = setting(
-        None, "SD of the distance, m; per robot and control step", 0.0, 10.0
+        None, "SD of the observed target distance, m; per robot and control step", 0.0, 10.0
     )
     target_bearing_noise: float | None = setting(
-        None, "SD of the bearing, rad; per robot and control step", 0.0, math.pi
+        None, "SD of the observed target bearing, rad; per robot and control step", 0.0, math.pi
     )
 
     def _check(self) -> None:

@@ -12,7 +12,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 # The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
-# The goal that reads an option.
+# By option: the key `goal`, and the goals that read the option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = dict.fromkeys(
     ("arrival", "target_speed"), ("goal", ("navigate",))
 )
@@ -21,7 +21,7 @@ Arrival = Literal["latch", "hold"]
 
 
 def _weight(default: float, meaning: str) -> Any:
-    """Returns the field of a reward weight."""
+    """Makes the setting of a reward weight."""
     return setting(default, meaning, -_MOST_WEIGHT, _MOST_WEIGHT)
 
 
@@ -38,15 +38,15 @@ class RewardConfig(Section):
     )
     arrival: float = _weight(
         0.0,
-        "once, on arrival; with arrival=hold and goal=gather, when all robots have arrived; "
-        "lifelong: at each target; cover: in each step that sees new floor",
+        "once, on arrival; arrival=hold or goal=gather: when all robots have arrived; "
+        "goal=lifelong: at each target; goal=cover: in each step in which the robot sees new floor",
     )
     contact: float = _weight(-0.2, "per contact event of any kind")
     touching: float = _weight(0.0, "per control step in which the robot touches something")
     step_penalty: float = _weight(-0.002, "per control step that begins before arrival")
     extra: dict[str, float] = field(
         default_factory=ByName,
-        metadata=about("weights of extension terms, by name; 0: off", -_MOST_WEIGHT, _MOST_WEIGHT),
+        metadata=about("weights of an extension's terms; 0: off", -_MOST_WEIGHT, _MOST_WEIGHT),
     )
 
 
@@ -54,7 +54,7 @@ class RewardConfig(Section):
 class TaskConfig(Section):
     """What a robot is asked to do, and what it observes."""
 
-    control_step: float = setting(0.032, "control step, s; Webots basicTimeStep", 0.001, 0.2)
+    control_step: float = setting(0.032, "length of a control step, s", 0.001, 0.2)
     step_limit: int = setting(500, "control steps of a training episode", 1, MAX_COUNT)
     target_radius: float = setting(
         0.05,
@@ -65,24 +65,24 @@ class TaskConfig(Section):
     goal: str = setting(
         "navigate",
         "navigate: each robot drives to its own target; lifelong: to one target after another; "
-        "gather: all robots come together; cover: they see the whole floor; or the name of an "
-        "extension's goal",
+        "gather: all robots come together; cover: together they see the whole floor; or the name "
+        "of an extension's goal",
     )
     target_speed: float = setting(
-        0.0, "speed of the targets, which bounce off walls, m/s; 0: they stay [navigate]", 0.0, 0.2
+        0.0, "speed of the targets, which bounce off walls, m/s [goal=navigate]", 0.0, 0.2
     )
     arrival: Arrival = setting(
         "latch",
-        "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
-        "and the episode is complete when all are within their targets at once [navigate]",
+        "latch: a robot that reaches its target stops for good; hold: it keeps driving, and the "
+        "episode ends when all robots are at their targets at once [goal=navigate]",
     )
     encoding: Literal["auto", "metric", "webots"] = setting(
         "auto",
-        "units of observations; metric: m and rad; webots: as in Webots; auto: webots with "
-        "realism.infrared=webots, else metric",
+        "units of observations; metric: m and rad; webots: scaled as in Webots' find_and_avoid; "
+        "auto: webots with realism.infrared=webots, else metric",
     )
     observations: tuple[str, ...] | None = setting(
-        None, "observations of extensions, in order; null: all of them"
+        None, "names of the extension's observations to use, in order; null: all of them"
     )
     reward: RewardConfig = field(default_factory=RewardConfig)
 

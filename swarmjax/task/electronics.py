@@ -1,8 +1,8 @@
-"""A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
+"""A robot's electronics: from commands to wheel speeds, and from sensors to observations.
 
-Motors and sensors connect the policy to the arena. This module applies the realism
-factors to them, both in training and in evaluation. A factor that is off has no effect. With all
-factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
+This module applies the realism factors to motors and sensors, both in training and in evaluation. A
+factor that is off has no effect. With all factors off, a policy observes the exact ray lengths, and
+the wheels turn as commanded.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from swarmjax.task.observation import Encoding, Layout, Readings, View
 
 Array = Any
 EPUCK = RobotConfig()
-_SLACK = 1e-4  # share of a period, so that rounding does not delay a sample that is due now
+_SLACK = 1e-4  # share of a period; with it, rounding does not delay a sample that is due now
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ class Memory(NamedTuple):
 
     Attributes:
       commands: [..., D, R, 2] delayed commands, newest first.
-      infrared: [..., R, K] the last sample, before it is scaled.
+      infrared: [..., R, K] the last infrared sample, not yet scaled.
       seen: [..., D, R, O] delayed observations, newest first.
     """
 
@@ -83,7 +83,7 @@ class Sight(NamedTuple):
     """Exact quantities that the sensors measure.
 
     Attributes:
-      ray: [..., R, K] m, 0 to `Electronics.reach`.
+      ray: [..., R, K] ray lengths, m, 0 to `Electronics.reach`.
       reflectance: [..., R, K] reflectance of the surface that each ray hits; None for 1.
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
@@ -167,7 +167,7 @@ def reflectance(factors: Factors) -> infrared.Reflectance | None:
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode: all earlier commands are zero, and earlier observations the first one.
+    """Starts an episode; delayed commands are zero, and delayed observations equal the first one.
 
     Args:
       electronics: electronics of the program.
@@ -191,7 +191,7 @@ def begin(
 
 
 def _fill(latency: tuple[int, int] | None, first: Array, xp: Any) -> Array | None:
-    """Fills the queue of the largest latency with the first value; None without latency."""
+    """Makes a queue as long as the largest latency, full of the first value; None without one."""
     depth = latency[1] if latency else 0
     return xp.stack([first] * depth, axis=-3) if depth else None
 
@@ -199,7 +199,7 @@ def _fill(latency: tuple[int, int] | None, first: Array, xp: Any) -> Array | Non
 def _delay(
     queue: Array | None, newest: Array, latency: Array | None, xp: Any
 ) -> tuple[Array | None, Array]:
-    """Puts the newest values [..., R, n] into the queue; returns it, and the values due now."""
+    """Puts the newest values [..., R, n] into the queue; returns the queue and the values due."""
     if queue is None or latency is None:
         return queue, newest
     values = xp.concatenate([newest[..., None, :, :], queue], axis=-3)
@@ -223,7 +223,7 @@ def drive(
       memory: state before the control step.
       factors: factors of the episode.
       command: [..., R, 2] forward speed (m/s) and turn rate (rad/s).
-      motors: the drive with the nominal values that the firmware uses.
+      motors: the drive, with the nominal sizes and limits that the firmware uses.
       clock: [...] or [] control steps since the start.
       xp: `numpy` or `jax.numpy`.
 
@@ -313,7 +313,7 @@ def _read_counts(
     clock: Array,
     xp: Any,
 ) -> Array:
-    """Samples the counts of sensors with the response `kind`, [..., R, K]."""
+    """Samples the sensor counts [..., R, K] with the response `kind`."""
     wear = response.Wear(factors.infrared_noise, factors.infrared_gain, factors.dead_sensor)
     normal = None
     if factors.infrared_noise is not None:

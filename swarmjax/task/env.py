@@ -1,7 +1,7 @@
 """Reset and step of one arena, as pure functions.
 
-Use `vmap` to run many arenas. Arenas do not reset themselves here: a step reports its outcome, and
-the rollout decides whether to reset.
+Use `vmap` to run many arenas. A step does not reset an arena: it reports its outcome, and the
+rollout decides whether to reset.
 """
 
 from dataclasses import replace
@@ -39,17 +39,17 @@ class EnvState:
 
     Attributes:
       sim: a `PhysicsState` before and after a rollout; during a rollout, the engine's own data.
-      level: the level that the episode started from, with the targets of now.
+      level: the level that the episode started from, with the current targets.
       factors: realism factors of the episode, drawn from the level's seed.
       memory: state of the robots' electronics.
       observation: [R, O] input of the policy.
       clock: [] control steps since the start, int32.
       goal: state of the goal.
-      arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is within
-        its target now.
+      arrived: [R] whether the robot has arrived; with `task.arrival=hold`, whether it is at its
+        target now.
       distance: [R] distance to the target, m.
       apart: [R, 3] time since the last contact of each kind ended, s.
-      episode: sums since the start.
+      episode: sums since the start of the episode.
       path: the shortest paths to the targets; None if the reward does not use them.
     """
 
@@ -74,14 +74,14 @@ class TimeStep(NamedTuple):
       observation: [R, O].
       reward: [R].
       terminated: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
-        are within their targets.
+        robots are at their targets.
       truncated: [R] whether the robot ran out of time.
-      valid: [R] whether to learn from the transition: the robot drove (with `latch`, it had not
-        arrived before) and the physics is sound.
+      valid: [R] whether to learn from the transition: the robot was driving (with `latch`, it had
+        not arrived before) and the arena is `sound`.
       done: [] whether the arena's episode is over.
       sound: [] whether physics, rewards, distances and observations are all finite, and no robot
         has more neighbours than `neighbours.room` allows for.
-      measured: [K] the goal's own measures so far.
+      measured: [K] current values of the goal's own measures.
     """
 
     observation: Array
@@ -137,7 +137,7 @@ def reset(world: World, level: Level) -> EnvState:
 def _measure_path(
     world: World, level: Level, before: geodesic.Path | None = None, pose: Array | None = None
 ) -> geodesic.Path | None:
-    """Measures the shortest paths from the starts or from poses [R, 3], if the reward uses them."""
+    """Measures the paths from the starts, or from poses [R, 3]; None if the reward needs none."""
     if not world.task.reward.path_progress:
         return None
     hull, impl = world.robot.hull_radius, world.physics.engine.impl
@@ -164,8 +164,8 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena, with `sim` as the physics' own data. Fields of a subclass of `EnvState`
         pass through unchanged.
-      action: [R, U] command, clipped to -1..1; -1 and 1 are the ends of its range. Broadcast
-        numbers start at the third entry.
+      action: [R, U] forward speed and turn rate, clipped to -1..1; -1 and 1 are the ends of each
+        command's range.
 
     Returns:
       The new state, and the outcome of the step.
@@ -174,7 +174,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     active = state.level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    looked, around = _look(world, pose, state.level, state.factors)  # at the targets of before
+    looked, around = _look(world, pose, state.level, state.factors)  # still at the old targets
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
@@ -202,7 +202,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     sound &= _is_finite(sight.distance, level.present) & _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
-    # Learning skips the step of a broken arena, so the critic need not see it either.
+    # Learning skips the step of a broken arena, so its observation can be the previous one.
     seen = jnp.where(sound, seen, state.observation)
     counted = valid & world.goal.is_under_way(state.arrived)
     episode = _tally(state.episode, gained, begins, earned, counted)
@@ -222,7 +222,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
 def _turn(
     world: World, state: EnvState, sight: Sight, pose: Array, clock: Array
 ) -> tuple[Turn, Level, Sight]:
-    """Asks the goal; returns its answer, the level with the new targets, and the sight of them."""
+    """Asks the goal; returns its turn, the level with new targets, and their distance in sight."""
     view = task_electronics.view(sight, pose, state.level, state.arrived, clock)
     turn = world.goal.turn(state.goal, state.level, view)
     if not world.goal.moves:
@@ -242,7 +242,7 @@ def _reward_step(
     pose: Array,
     action: Array,
 ) -> reward.Step:
-    """Assembles the input of the reward terms; `sight` is still of the targets of before."""
+    """Assembles the input of the reward terms; `sight` still measures the old targets."""
     step = reward.Step(
         distance_before=before.distance,
         distance=sight.distance,
@@ -277,7 +277,7 @@ def _move(
     """Steps the physics; only active robots obey their commands.
 
     Returns:
-      Data, memory, poses, and whether the physics is sound.
+      Data, memory, poses, and whether all numbers of the physics are finite.
     """
     found, level = state.factors, state.level
     command = sim_drive.command(action, world.drive, jnp)
@@ -288,13 +288,13 @@ def _move(
     chassis = task_electronics.chassis(found)
     data = physics.step(world.physics, state.sim, level.side, level.obstacle, wheels, chassis)
     sound = physics.is_finite(data)
-    # To keep everything below finite, a broken arena shows its last sound poses until it is reset.
+    # A broken arena keeps its last finite poses until it is reset, so other numbers stay finite.
     before, after = (physics.poses(world.physics, each) for each in (state.sim, data))
     return data, memory, jnp.where(sound, after, before), sound
 
 
 def _look(world: World, pose: Array, level: Level, factors: Factors) -> tuple[Sight, Surround]:
-    """Looks around from poses [R, 3]."""
+    """Measures what the sensors can see from poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     shades = task_electronics.reflectance(factors)
     scene = senses.Scene(pose, level.side, level.obstacle, factors.infrared_yaw, shades)

@@ -48,17 +48,17 @@ class Ended(NamedTuple):
 
     Attributes:
       episodes: 1 where an episode ended.
-      stage: stage on which the episode began.
-      cohort: cohort in which the episode began; -1 where no episode ended.
-      targets: robots present.
-      reached: robots that had arrived at the end.
+      stage: index of the stage on which the episode began.
+      cohort: the curriculum's cohort in which the episode began; -1 where no episode ended.
+      targets: number of robots present.
+      reached: number of robots that had arrived at the end.
       all_reached: 1 where every robot had arrived.
-      steps: control steps.
+      steps: control steps of the episode.
       robot_steps: control steps before arrival, summed over robots.
       sensed: control steps in which a ray was shorter than the infrared range.
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
-      broken: 1 where the episode ended because the arena was no longer `sound`.
+      broken: 1 where the episode ended because `TimeStep.sound` was false.
       measured: [.., K] the goal's own measures; None if it has none.
       robots: results per robot, if `run.episodes` asks for them.
     """

@@ -1,4 +1,4 @@
-"""Runs the pieces of an extension in an arena, and checks that they fit the arena."""
+"""Runs the pieces of an extension in an arena, and checks the shapes that they return."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -45,7 +45,7 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
       uniforms: uniform numbers, as `level.sample` takes them.
       stage: fields [].
       spacing: sizes.
-      drawings: extension drawings, in the order that `stage.drawing` counts.
+      drawings: level drawings of the extension; `stage.drawing` is 1 + the index of one of them.
 
     Returns:
       The level; absent robots and obstacles are parked outside.
@@ -91,7 +91,7 @@ def _compiled(piece: LevelDrawing) -> Callable[[Level], Level]:
 
 
 def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> None:
-    """Refuses pieces that return a wrong shape or type; compiles nothing.
+    """Refuses pieces that return a wrong shape or type, without compiling them.
 
     Args:
       chosen: the pieces.
@@ -100,7 +100,7 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
       obstacles: M.
 
     Raises:
-      ConfigError: a piece returns something else; the message says what it should return.
+      ConfigError: a piece returns a wrong shape or type; the message gives the right one.
     """
     drawn = level_shapes(robots, obstacles)
     seen = view_shapes(drawn, robot)
@@ -180,7 +180,7 @@ def _step(infrared: Any, sensor_range: float) -> Step:
 
 
 def view_shapes(drawn: Level, robot: RobotConfig) -> View:
-    """Returns the shapes of a view's fields, in a level of these shapes."""
+    """Returns the shapes of a view's fields, given those of a level."""
     robots = drawn.present.shape[0]
     sight = Sight(_shape(robots, len(robot.sensor_poses)), None, _shape(robots), _shape(robots))
     there, clock = _shape(robots, dtype=bool), _shape(dtype=jnp.int32)

@@ -1,7 +1,7 @@
 """Realism factors of one episode: the properties of its robots, sensors and surfaces.
 
-All factors follow from the episode's seed, so they are part of the level. The code takes the array
-module as an argument, so NumPy and JAX draw the same factors.
+The level's seed determines all factors. The code takes the array module as an argument, so NumPy
+and JAX draw the same factors.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Settings that draw random numbers at every control step. These settings need the seed as well.
+# Settings that draw random numbers at every control step; an episode with one keeps its seed.
 _PER_STEP = ("speed_noise", "target_distance_noise", "target_bearing_noise")
 
 
@@ -23,21 +23,21 @@ class Factors(NamedTuple):
     """The factors of an episode; a factor that is off is None.
 
     Attributes:
-      seed: [...] uint32 seed of everything drawn at each control step; None without randomness.
+      seed: [...] uint32 seed of the numbers drawn at each control step; None if nothing is random.
       wheel_radius: [..., R, 2] radius of the left and the right wheel, m.
       track: [..., R] effective track, m.
-      max_wheel_speed: [..., R] rad/s.
-      mass: [..., R] kg.
+      max_wheel_speed: [..., R] speed limit of each wheel, rad/s.
+      mass: [..., R] mass of the robot, kg.
       friction: [..., R] friction between wheels and floor.
-      infrared_noise: [..., R, K] factor on the noise of the response.
-      infrared_gain: [..., R, K] factor on the reflected part of the response.
-      infrared_yaw: [..., R, K] rad.
-      infrared_period: [..., R] s between samples.
+      infrared_noise: [..., R, K] factor on the noise of the sensor counts.
+      infrared_gain: [..., R, K] factor on the reflected part of the sensor counts.
+      infrared_yaw: [..., R, K] yaw error of the sensor, rad.
+      infrared_period: [..., R] time between samples, s.
       dead_sensor: [..., R, K] whether the sensor never detects anything.
-      reflectance: [..., 1 + M] of all walls, and of each obstacle.
-      reflectance_robot: [..., R].
-      action_latency: [..., R] control steps, int32.
-      observation_latency: [..., R] control steps, int32.
+      reflectance: [..., 1 + M] reflectance of all walls, then of each obstacle.
+      reflectance_robot: [..., R] reflectance of the robot.
+      action_latency: [..., R] delay of commands, control steps, int32.
+      observation_latency: [..., R] delay of observations, control steps, int32.
     """
 
     seed: Array | None = None
@@ -80,7 +80,7 @@ def _normal(deviation: Any, drawn: Array, xp: Any) -> Array:
 
 
 # How the factor of each setting is drawn, and its axes: R robots, K sensors, F walls and obstacles.
-# Each has the random stream of its name.
+# The random stream of a factor has the same name.
 _DRAWN = {
     "wheel_radius": (_uniform, "R"),
     "track": (_uniform, "R"),
@@ -109,20 +109,13 @@ def draw(
 ) -> Factors:
     """Draws the factors of an episode.
 
-    Each factor has its own random numbers, so switching one off leaves the others unchanged.
+    Each factor has its own random stream, so switching one off leaves the others unchanged.
     Adding robots leaves the factors of the existing robots unchanged. `configs/realism/` holds the
     ranges and their sources.
 
-    The factors are drawn per robot, per sensor or per surface, according to their cause:
-
-    - Wheel radius: each robot draws one radius for both wheels.
-    - Track: each robot draws its effective track, since tyres grip somewhere across their width.
-    - Latency and sampling period: each robot draws its own, since radio link and firmware determine
-      them.
-    - Gain and yaw: each sensor draws its own.
-    - Reflectance: each obstacle and each robot draws its own. All walls of the arena share one
-      reflectance.
-    - Friction: each robot draws the friction of its wheels on the floor.
+    `Factors` lists the factors of each robot, sensor and surface. Both wheels of a robot have the
+    same radius. Robots differ in effective track, since tyres grip somewhere across their width,
+    and in latency and sampling period, since these depend on radio link and firmware.
 
     Args:
       seed: [...] uint32, one per episode.
@@ -151,14 +144,14 @@ def draw(
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """Returns the robot to compile the model for, with the largest values of any episode.
+    """Returns the robot to compile the model for, with the largest wheels of any episode.
 
     Args:
       robot: the nominal robot.
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius that no draw exceeds; its speeds are not for driving.
+      The robot, with the largest wheel radius that can be drawn. Do not take speed limits from it.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     return replace(robot, wheel_radius=most, wheel_limit="clip")

@@ -23,9 +23,8 @@ FENCE_HALF_LENGTH = 0.25 / EXAMPLE_SIDE  # share of the arena's side
 FENCE_HALF_WIDTH = 0.03  # m; not scaled, since a real wall keeps its thickness
 BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
-# Centres of the boxes in the example's arena, in order of use. The boxes lie between starts and
-# targets. In arenas of 1 m and more, at least 0.10 m is free between two boxes. This project chose
-# them.
+# Centres of the boxes in the example's arena, in order of use; this project chose them. The boxes
+# lie between starts and targets. In arenas of 1 m and more, at least 0.10 m is free between two.
 BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
 
 
@@ -53,7 +52,7 @@ def starts(robots: int, side: Array, xp: Any) -> Array:
 
 
 def targets(robots: int, side: Array, xp: Any) -> Array:
-    """Places the targets: columns of two, from the far corner back along the wall.
+    """Places the targets in columns of two, from the far corner back along the lower wall.
 
     Args:
       robots: R.
@@ -76,7 +75,7 @@ def obstacles(count: int, side: Array, fenced: Array, xp: Any) -> Array:
     Args:
       count: M.
       side: [] side of the arena, m.
-      fenced: [] whether the obstacles are the fence.
+      fenced: [] whether to place the fence instead of boxes.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Levels: the starting conditions of an episode, drawn at a fixed cost from uniform numbers.
+"""Levels: the starting conditions of an episode, drawn from uniform random numbers.
 
 The code takes the array module as an argument. NumPy and JAX draw the same level from the same
 numbers.
@@ -64,7 +64,7 @@ class Level(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """Sizes that a level is drawn with, fixed for a program.
+    """Sizes for drawing levels, fixed for a program.
 
     Attributes:
       robots: largest number of robots, R.
@@ -101,11 +101,11 @@ def uniform_count(spacing: Spacing) -> int:
 def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     """Draws a level of a stage.
 
-    A random level places obstacles, then targets, then starts, without overlap. Obstacles keep
-    a `passage` clear between each other and to the walls. An obstacle that finds no such place is
-    left out. Where the arena has room, targets keep their distance from each other and from
-    obstacles, so that a robot can pass between any two arrived robots. Every target then stays
-    reachable, whatever the order of arrival.
+    A random level places obstacles, then targets, then starts, without overlap. Obstacles leave a
+    `passage` between each other and to the walls. An obstacle without such a place is left out.
+    Where the arena has room, targets keep their distance from each other and from obstacles, so
+    that a robot can pass between any two arrived robots. Every target then stays reachable,
+    whatever the order of arrival.
 
     Args:
       uniforms: [uniform_count(spacing)] float32 in [0, 1).
@@ -272,7 +272,7 @@ def _mapped(drawn: _Uniforms, stage: Stage, arena: MapArrays, spacing: Spacing, 
 def _laid_out(
     kind: Kind, of: LayoutArrays, seed: Array, stage: Stage, spacing: Spacing, xp: Any
 ) -> Level:
-    """Lays out an arena. Robots and walls that the layout does not have are absent."""
+    """Draws a level of a layout. Robots and walls that the layout does not have are absent."""
     present = xp.arange(spacing.robots) < stage.robots
     count = drawing.uniform_count(kind, spacing.robots)
     uniforms = noise.uniform(seed, 0, Stream.LAYOUT, (count,), xp)
@@ -298,9 +298,9 @@ def _laid_out(
 
 
 def _at_distance(level: Level, distance: Array, spacing: Spacing, xp: Any) -> Level:
-    """Moves the starts to places with a given way to their targets, if the stage gives one.
+    """Moves the starts so that paths to targets have the length that the stage gives, if any.
 
-    A level without room for all robots keeps its own starts.
+    If such starts have no room for all robots, the level keeps its own starts.
     """
     sizes = spacing.hull_radius, spacing.target_radius
     place, _, has_room = ways.starts(level, distance, *sizes, xp)

@@ -26,9 +26,8 @@ Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
 MOST_CELLS = 48  # largest number of cells in a row, and largest number of rows
-# Starts and targets may be placed on a set of points. The numbers below are the least distance
-# between two points (m), and the largest number of points. An area with more cells than this number
-# gets one point per cell.
+# Starts and targets are placed on a set of points. The numbers below are the least distance between
+# two points (m), and the largest number of points. An area with more cells gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024
 
 
@@ -56,11 +55,11 @@ class MapArrays(NamedTuple):
     Attributes:
       mapped: whether the stage has a map, bool.
       wall: [W, 5] walls, as in `Map`, float32.
-      start: [C, 2] starts in units, int32.
+      start: [C, 2] starts, 1/4096 m, int32.
       start_open: [C] whether the start is a point of this stage, bool.
-      target: [D, 2] targets in units, int32.
+      target: [D, 2] targets, 1/4096 m, int32.
       target_open: [D] whether the target is a point of this stage, bool.
-      pair: [P, 2, 2] pairs in units, int32.
+      pair: [P, 2, 2] start and target of each pair, 1/4096 m, int32.
       pairs: number of pairs that the stage has, int32.
     """
 
@@ -148,7 +147,7 @@ def _check_reach(
     targets: Sequence[Cell],
     pairs: Sequence[tuple[Cell, Cell]],
 ) -> None:
-    """Refuses a target that no sequence of steps between adjacent cells can reach."""
+    """Refuses a target that cannot be reached by steps between adjacent cells."""
     if bool(starts) != bool(targets) or not (starts or pairs):
         raise ConfigError(
             f"map has {len(starts)} cells with S and {len(targets)} with T: give both, or a letter "

@@ -1,19 +1,19 @@
-"""Which objects are nearest."""
+"""Finds the nearest objects."""
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-# The work of counting grows with the square of the number of objects, and the length of the
-# compiled program grows with the number.
+# The time of counting grows with the square of the number of objects, and the compiled program
+# grows in proportion to the number.
 _MOST_COUNTED = 64
 
 
 def nearest(distance: Array, count: int) -> Array:
     """Orders objects by distance.
 
-    The function counts how many objects are nearer than each one. For rows this short, this is
-    faster than sorting (docs/performance.md).
+    Up to `_MOST_COUNTED` objects, the function counts how many objects are nearer than each one,
+    which is faster than sorting (docs/performance.md).
 
     Args:
       distance: [..., N] of N objects, m; inf comes last. If any is NaN, the indices have no
@@ -21,8 +21,7 @@ def nearest(distance: Array, count: int) -> Array:
       count: how many objects to return, at most N.
 
     Returns:
-      [..., count] indices, nearest first. Of two objects at the same distance, the first one comes
-      first.
+      [..., count] indices, nearest first. Objects at the same distance keep their order.
     """
     if distance.shape[-1] > _MOST_COUNTED:
         return jnp.argsort(distance, axis=-1, stable=True)[..., :count]

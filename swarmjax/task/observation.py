@@ -1,9 +1,8 @@
 """Observations: only this module defines which entries exist, and in which order.
 
-`INPUTS` is the table of built-in entries. `layout` describes them to other modules. Policy files,
-evaluations, exports and tests take names, units and sizes from `layout`. To add an input, add one
-row to `INPUTS`, its names to `extension.TAKEN` and, if the input is a new quantity, one
-field to `Readings`.
+`INPUTS` is the table of built-in entries. Other modules take names, units and sizes from `layout`.
+To add an input, add one row to `INPUTS`, its names to `extension.TAKEN` and, if the input is a new
+quantity, one field to `Readings`.
 """
 
 import math
@@ -36,7 +35,7 @@ class Readings(NamedTuple):
 
 
 class Coding(NamedTuple):
-    """Scaling in an encoding, (quantity - offset) / scale; all three numbers are in `unit`."""
+    """How an encoding scales a quantity: (quantity - offset) / scale, all three in `unit`."""
 
     unit: str
     offset: float = 0.0
@@ -44,7 +43,7 @@ class Coding(NamedTuple):
 
 
 class Input(NamedTuple):
-    """Entries of an observation that belong together.
+    """One input of the policy, with one or more entries of the observation.
 
     Attributes:
       names: names of the entries.
@@ -57,10 +56,10 @@ class Input(NamedTuple):
     codings: Mapping[Encoding, Coding]
 
 
-# The paper says ten inputs and names nine. The tenth is the bearing, as in the published example
-# that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a).
-# The scaled values are counts / 1023 without clipping, distance / 1.5 m, and (bearing + pi) / (2
-# pi), so a scaled bearing of 0.5 is dead ahead.
+# The paper speaks of ten inputs and names nine. We add the bearing, as in the published example
+# that the task is based on. `webots` scales as find_and_avoid of deepworlds does (commit 60b8fc4a):
+# counts / 1023 without clipping, distance / 1.5 m, and (bearing + pi) / (2 pi), so a scaled bearing
+# of 0.5 is dead ahead.
 INPUTS = (
     Input(
         ("infrared",),  # one entry for each sensor
@@ -191,12 +190,12 @@ class View(NamedTuple):
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] x (m), y (m).
-      distance: [R] distance to the own target, m.
-      bearing: [R] bearing of the own target, rad.
+      distance: [R] distance to the robot's own target, m.
+      bearing: [R] bearing of the robot's own target, rad.
       infrared: [R, K] length of each ray, m.
       present: [R] whether the robot is present, bool.
       arrived: [R] whether the robot has arrived, bool; with `task.arrival=hold`, whether it is
-        within its target now.
+        at its target now.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       obstacle_present: [M] bool.

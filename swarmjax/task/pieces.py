@@ -33,7 +33,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
       extensions: the available pieces.
       task: the task, which names observations and weights. By default, all observations are used,
         and each term has its own default weight.
-      stages: name level drawings.
+      stages: the stages, which may name level drawings.
 
     Returns:
       The pieces.
@@ -58,7 +58,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
 
 
 def resolve(extensions: Extensions, task: TaskConfig) -> TaskConfig:
-    """Fills in the pieces that a task uses, so that its config names all of them.
+    """Fills in a task's default pieces, so that its config names all that it uses.
 
     Args:
       extensions: the available pieces.

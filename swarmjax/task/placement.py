@@ -25,7 +25,7 @@ class Gap(NamedTuple):
     """Least distance between two centres, in units.
 
     Attributes:
-      hard: distance that is always kept, if any point is that far away.
+      hard: distance that is always kept if any point allows it.
       soft: distance that is kept where the arena has room.
     """
 
@@ -232,8 +232,8 @@ def fold(
 
 
 def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S:
-    """Calls `step(i, state)` for each i below `count`; XLA takes long to compile it unrolled."""
-    if xp is not np and count:  # JAX traces the step even if it is called for nothing
+    """Calls `step(i, state)` for each i below `count`, not unrolled, so that XLA compiles fast."""
+    if xp is not np and count:  # JAX would trace the step even if `count` is 0
         from jax import lax  # evaluations draw levels without JAX
 
         return lax.fori_loop(0, count, step, state)
@@ -243,7 +243,7 @@ def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S
 
 
 def choose(score: Array, pick: Array, xp: Any) -> Array:
-    """Picks uniformly among the points that score 0; without any, picks the best point."""
+    """Picks uniformly among the points that score 0; if there are none, picks the highest score."""
     rank = xp.cumsum((score >= 0).astype(xp.int32))
     free = rank[-1]
     wanted = xp.floor(pick * free.astype(xp.float32)).astype(xp.int32)

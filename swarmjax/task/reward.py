@@ -3,7 +3,7 @@
 Equation 3 of the paper is `progress` with weight 1 and `proximity` with weight -0.001.
 To add a built-in term, add a function, a row of `TERMS`, a weight in `RewardConfig` and a test.
 Terms of an extension need no change here; see `swarmjax.extension.reward_term`.
-Training gives JAX arrays and replays give NumPy arrays; the terms use the module of their arrays.
+Terms take JAX arrays in training and NumPy arrays in replays.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ class Step(NamedTuple):
 
     Attributes:
       distance_before: [R] distance to the target, m.
-      distance: [R] distance after the step to the same target, m; it may move only then.
+      distance: [R] distance after the step, to where the target was during the step, m.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
@@ -31,7 +31,7 @@ class Step(NamedTuple):
       outside: [R] whether the robot had not yet arrived when the step began.
       path_before: [R] distance along the shortest path to the target, m. None for a reward without
         a path weight, and for terms of an extension.
-      path: [R] the same distance after the step, m.
+      path: [R] distance along the shortest path after the step, m.
       pose_before: [R, 3] x (m), y (m), yaw (rad). This field and the fields below are for
         extensions only.
       pose: [R, 3] the pose after the step.
@@ -101,7 +101,7 @@ def step_penalty(step: Step) -> Array:
 
 
 def _number(step: Step, values: Array) -> Array:
-    """Returns values as numbers of the kind of the distances."""
+    """Converts values to the number type of the distances."""
     return values.astype(step.distance.dtype)
 
 

@@ -28,7 +28,7 @@ def check(
     """Refuses stages in which robots or targets would overlap, or lie outside the walls.
 
     Args:
-      stages: stages to run. Random and fixed levels fit all hulls up to the e-puck's.
+      stages: stages to run. Random and fixed levels always fit hulls up to the e-puck's.
       spacing: sizes.
       drawings: level drawings of an extension.
 
@@ -41,7 +41,7 @@ def check(
             for drawn in _levels(stage, spacing, drawings):
                 _check_own(own, stage, drawn, spacing)
         elif must_check(stage, spacing.hull_radius):
-            # A level in which no starts have the way and room keeps those that are checked here.
+            # A level without room for starts at `distance` keeps those that are checked here.
             for drawn in _levels(replace(stage, distance=None), spacing):
                 check_level(stage, drawn, spacing)
         if stage.distance is not None:
@@ -95,7 +95,7 @@ def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
 
 
 def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level of an extension, whose targets may overlap."""
+    """Refuses an extension's level in which robots do not fit; its targets may overlap."""
     from swarmjax.task import extended  # with JAX
 
     problem = _problem(extended.redraw(own, drawn), spacing, ("robot", "wall"), ("wall",))
@@ -104,7 +104,7 @@ def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spa
 
 
 def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> None:
-    """Refuses a distance at which a robot has arrived, or that no level has."""
+    """Refuses a distance within the target's radius, or that no sampled level allows."""
     least = round(spacing.target_radius + MARGIN, 4)
     ends = np.array(stage.distance_units)
     if ends[0] < round_up(least):
@@ -113,7 +113,7 @@ def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[Lev
             f"{spacing.target_radius:g} m of its target: give at least {least:g}."
         )
     sizes = spacing.hull_radius, spacing.target_radius
-    # Absent robots would take as long as the others.
+    # This leaves out absent robots, which would take as long as the others.
     own = spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
     levels = _levels(replace(stage, distance=None), own, drawings)
     if not any(ways.starts(each, ends, *sizes, np)[1].any() for each in levels):

@@ -1,4 +1,4 @@
-"""Stages of the curriculum as arrays; stages differ in values, never in shapes."""
+"""Stages of the curriculum as arrays that differ in values, never in shapes."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ Array = Any
 
 
 class Stage(NamedTuple):
-    """One stage ([]) or all of them ([S]).
+    """One stage (fields []) or all stages (fields [S]).
 
     Attributes:
       robots: number of robots, int32.
@@ -32,8 +32,8 @@ class Stage(NamedTuple):
       drawing: 1 + index of the extension drawing of the stage's levels, 0 for none, int32.
       map: the maps; None if no stage has one.
       layouts: numbers of the stages' layouts, by kind; None if no stage has one.
-      distance: smallest and largest way from start to target, [2] units, int32; 0 for any; None
-        if no stage has one.
+      distance: [2] shortest and longest path from start to target, 1/4096 m, int32; 0 for any; None
+        if no stage sets it.
       laid_out: true if all stages have a layout; None if any stage has none.
     """
 

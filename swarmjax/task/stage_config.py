@@ -24,10 +24,10 @@ from swarmjax.task.placement import UNITS
 DISC = 0.15  # m, edge of the square around the disc of a start or a target
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 _DISC_PER_HULL, _PASSAGE_PER_HULL = 4.05, 2.7  # lengths per hull radius; as for the e-puck
-FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
+FILLING = 0.4  # largest share of the free square that obstacles placed at random may take
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
-# Squares of lengths fit an int32, and points suffice, up to these numbers; plots go further.
+# Up to these numbers, squared lengths fit an int32 and points suffice; `plots` allows more.
 _MOST_OBSTACLES, _MOST_ROBOTS, _LARGEST_SIDE = 112, 100, 4.0
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 _Length = float | tuple[float, float] | None
@@ -72,22 +72,22 @@ def _read_map(rows: tuple[str, ...], cell: float) -> maps.Map:
 
 @dataclass(frozen=True, kw_only=True)
 class StageConfig(Section):
-    """One stage: number of robots, arena size and obstacles."""
+    """Settings of one stage: number of robots, arena size and obstacles."""
 
-    name: str = field(metadata=about("name of the stage: the name of its file"))
-    robots: int = field(metadata=about("active robots", 1, 1024))
+    name: str = field(metadata=about("name of the stage, equal to the name of its file"))
+    robots: int = field(metadata=about("number of robots", 1, 1024))
     side: float | tuple[float, float] = field(
-        metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 40.0)
+        metadata=about("side of the square arena, m; from a range, each level draws it", 0.4, 40.0)
     )
     distance: _Length = setting(
         None,
-        "way from start to target round walls, m, or a range; null: as the level has it",
+        "length of the path from start to target around walls, m, or a range; null: any",
         0.05,
         50.0,
     )
-    obstacles: int = setting(0, "obstacles; set by a layout but plots", 0, 256)
+    obstacles: int = setting(0, "number of obstacles; layouts except plots set it", 0, 256)
     obstacle_size: float = setting(
-        0.10, "edge of the square boxes of a random level, or on plots, m", 0.02, 0.3
+        0.10, "edge of the square boxes of level=random or plots, m", 0.02, 0.3
     )
     level: str = setting(
         "random",
@@ -95,15 +95,15 @@ class StageConfig(Section):
         f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
         "of an extension's level drawing",
     )
-    layout: Literal["boxes", "fence"] = setting("boxes", "obstacles of a fixed level")
+    layout: Literal["boxes", "fence"] = setting("boxes", "obstacles of level=fixed")
     map: tuple[str, ...] = setting(
         (),
-        "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
-        "its capital for one robot; sets side, obstacles and level",
+        "arena as rows of text: # wall, . floor, S start area, T target area, another letter: "
+        "start of one robot, its capital: target; sets side, obstacles and level",
     )
     cell: float = setting(0.12, "edge of a map cell, m", _SMALLEST_CELL, 1.0)
     breadth: _Length = setting(
-        None, "breadth of a layout's arena (null: as long as side), m, or a range", 0.2, 4.0
+        None, "breadth of a layout's arena, m, or a range; null: equal to side", 0.2, 4.0
     )
     gap: _Length = setting(
         None, "free width of a door or a corridor, m, or a range", _SMALLEST_CELL, 1.0
@@ -117,7 +117,7 @@ class StageConfig(Section):
     apart: _Length = setting(
         None, "distance between targets, or from targets to a door, m, or a range", 0.05, 1
     )
-    cells: int | None = setting(None, "cells along a side of a maze or of blocks", 2, 8)
+    cells: int | None = setting(None, "cells along a side of level=maze or blocks", 2, 8)
 
     def _check(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", self.level):
@@ -143,7 +143,7 @@ class StageConfig(Section):
             )
 
     def _check_number(self) -> None:
-        """Refuses numbers too large for levels whose objects or starts are placed in turn."""
+        """Refuses numbers too large for levels that place objects or starts one after the other."""
         most = {"robots": _MOST_ROBOTS, "side": _LARGEST_SIDE, "obstacles": _MOST_OBSTACLES}
         for key, limit in most.items():
             if (self.sides[1] if key == "side" else getattr(self, key)) > limit:
@@ -225,7 +225,7 @@ class StageConfig(Section):
 
     @property
     def kind(self) -> Kind | None:
-        """The part of the layout that is compiled in; None without a layout."""
+        """The settings of the layout that are fixed at compile time; None without a layout."""
         if self.level not in LAYOUTS:
             return None
         cells = self.obstacles if self.level == "plots" else self.cells or 0
@@ -233,7 +233,7 @@ class StageConfig(Section):
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
-        """The layout and its numbers in units, as `drawing.stack` takes them; None without one."""
+        """The entry for `drawing.stack`, lengths in 1/4096 m; None without a layout."""
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
@@ -253,7 +253,7 @@ class StageConfig(Section):
 
     @property
     def distance_units(self) -> tuple[int, int]:
-        """The smallest and the largest way from start to target, units; 0 for any."""
+        """The shortest and longest path from start to target, 1/4096 m; 0 if any will do."""
         low, high = _ends(self.distance or 0.0)
         return round(low * UNITS), round(high * UNITS)
 
@@ -264,7 +264,7 @@ class StageConfig(Section):
 
 
 def passage(hull: float) -> float:
-    """Returns the passage between obstacles that robots of this hull radius get, m."""
+    """Returns the width of passages between obstacles for robots of this hull radius, m."""
     return max(PASSAGE, _PASSAGE_PER_HULL * hull)
 
 
@@ -276,12 +276,12 @@ def smallest_side(stage: StageConfig, hull: float = epuck.HULL_RADIUS) -> float:
     passage on either side of any single obstacle.
 
     A random level places its obstacles one after the other. The obstacles may take at most the
-    share FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980),
-    which is 0.70 of a square grid of discs. Walls make them jam even earlier.
+    share FILLING of the free square. Discs placed this way leave no room for another one at 0.547
+    of the area (Feder 1980), 0.70 of what a square grid of discs covers. Walls lower this share.
 
     Args:
       stage: the stage; its `side` is not read.
-      hull: radius of the robots, m. The numbers above are those of hulls up to the e-puck's.
+      hull: radius of the robots, m. The numbers above hold for hulls up to the e-puck's.
 
     Returns:
       The side, m.
@@ -301,14 +301,14 @@ def smallest_plots(stage: StageConfig) -> float:
 
 
 def make_room(sim: SimConfig, stages: Sequence[StageConfig]) -> SimConfig:
-    """Sets the numbers of robots and obstacles to compile for, unless the settings give them.
+    """Sets how many robots and obstacles to compile for, unless the settings give the numbers.
 
     Args:
       sim: the settings.
       stages: stages that must fit.
 
     Returns:
-      The settings with both numbers. These are at least 5 robots and 4 obstacles, so that the
+      The settings with both numbers: by default at least 5 robots and 4 obstacles, so that the
       stages of a curriculum share a program and its checkpoints.
     """
     robots = max([sim.robots, *(stage.robots for stage in stages)])

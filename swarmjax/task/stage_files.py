@@ -1,4 +1,4 @@
-"""Finds the stages that a choice of configs/stage/ names: one stage or a sequence."""
+"""Reads the files of configs/stage/, each of which holds one stage or a sequence of stages."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ def expand(stage: dict[str, Any], choice: str) -> list[dict[str, Any]]:
       choice: the name of its file.
 
     Raises:
-      ConfigError: the file or its sequence is invalid, or the file does not take these keys.
+      ConfigError: the file or its sequence is invalid, or keys are set for a sequence.
     """
     if not _is_sequence(choice):
         return [_named(stage, choice)]
@@ -50,7 +50,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
 
     Args:
       choice: the name of the file.
-      key: the key that names it, for messages.
+      key: the key that names the file, for messages.
 
     Raises:
       ConfigError: there is no file of this name, or the file names several stages.
@@ -67,12 +67,11 @@ def load_levels[C: Section](
 
     Args:
       cls: the command's dataclass, with `stage` and `suite`.
-      overrides: `key=value` words.
+      overrides: `key=value` arguments.
       stage: plain data of the default stage; None for the stage of the command's file.
 
     Raises:
-      ConfigError: a word is invalid, or a suite is given together with a key that the suite sets
-        itself.
+      ConfigError: an argument is invalid, or sets a key that the suite sets itself.
     """
 
     def fill_in(mapping: dict[str, Any], chosen: dict[str, str]) -> dict[str, Any]:
@@ -131,7 +130,7 @@ def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
 
 
 def _check_name(stage: dict[str, Any], choice: str) -> None:
-    """Refuses a name that is not the file's."""
+    """Refuses a stage whose name is not that of its file."""
     name = name_of(choice)
     given = stage.get("name", name)
     if given != name:

@@ -18,12 +18,12 @@ from swarmjax.task.nearest import nearest
 
 NEAREST_ROBOTS = 8
 NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
-# m; anything farther away is shown at this distance, in its direction. The stage files have arenas
-# up to this wide. The numbers are not normalised: most rows are 0, so a running deviation would be
-# small and would magnify the first entries.
+# m; anything farther away is shown at this distance, in its direction. Arenas of the stage files
+# are at most this wide. The surroundings are not normalised: most rows are 0, so a running
+# deviation would be small and would magnify the first entries.
 REACH = 2.0
 FARTHEST = 4.0  # m; the largest distance to go that is shown, because paths wind around walls
-_NEAR = 1e-3  # m; below it, the direction to a waypoint fades
+_NEAR = 1e-3  # m; at smaller distances, the direction to a waypoint is shorter than 1
 
 _OWN = 6  # target x, y; arrived; distance to go; direction to the waypoint x, y
 _ROBOT = 8  # presence; x, y, heading x, y, target x, y, arrived

@@ -1,12 +1,12 @@
-"""Places starts at a given way from their targets, along the shortest path round walls.
+"""Places starts from which the shortest paths around walls to the targets have a given length.
 
-Many points all over the arena have a shortest way to the target, through corners of a visibility
-graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
-Obstacles"). A point with a longer way than wanted moves along its first straight leg, until the
-rest is as long as wanted. All lengths are integers, so NumPy and JAX choose the same starts.
+For many points of the arena, a visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for
+Planning Collision-Free Paths Among Polyhedral Obstacles") gives the shortest path to the target. A
+point whose path is too long moves along the path's first straight leg, until the rest has the given
+length. All lengths are integers, so NumPy and JAX choose the same starts.
 
-Walls are widened as in `geodesic.py`. Ways turn at the corners of walls only. Among turned boxes,
-a start therefore sees its target past the squares around the boxes, and its way is straight.
+Walls are widened as in `geodesic.py`. Paths turn only at corners of walls. Among turned boxes,
+a start therefore sees its target past the squares around the boxes, and its path is straight.
 
 Axes: R robots, M obstacles, K = 4 M corners, P points. Lengths are units of 1/4096 m.
 """
@@ -39,12 +39,12 @@ Array = Any
 # Shares of the hull's radius, as in `geodesic.py`: walls are widened by the first, and corners are
 # set off by the second.
 _WIDENED, _CORNER = 0.8, 0.9
-_NO_WAY = 2**29  # length of a way that does not exist; an int32 holds the sum of two
+_NO_WAY = 2**29  # length of a path that does not exist; an int32 holds the sum of two
 _SQUARE = np.float32(1.41422)  # half edge of the square around a turned square of half edge 1
-_OTHER = 2**27  # subtracted from the score of a start with another way; soft scores are less
+_OTHER = 2**27  # subtracted from scores of starts with other path lengths; soft scores are less
 _POINTS = 576
 _LARGE = 2**15  # legs of a table that is made in blocks
-_TIGHT = 4e-3  # m; least free space beside walls, where there is not room for more
+_TIGHT = 4e-3  # m; least free space beside walls where there is no room for more
 # Multiples of these shares of 2**32 fill a square evenly, and no two points have the same x or y,
 # so that some lie in every narrow corridor (Roberts 2018, "The Unreasonable Effectiveness of
 # Quasirandom Sequences": 1 / g and 1 / g**2 with g**3 = g + 1).
@@ -59,9 +59,9 @@ class Plan(NamedTuple):
       points: [P, 2] points all over the arena.
       corner: [K, 2] corners of the widened walls.
       target: [R, 2].
-      to_corner: [P, K] lengths of legs from points to corners; here and below, `_NO_WAY` if barred.
+      to_corner: [P, K] lengths of legs from points to corners; `_NO_WAY` if blocked, also below.
       to_target: [P, R] lengths of legs from points to targets.
-      to_go: [R, K] ways from the corners to the targets.
+      to_go: [R, K] path lengths from the corners to the targets.
     """
 
     points: Array
@@ -75,21 +75,21 @@ class Plan(NamedTuple):
 def starts(
     level: Any, distance: Array, hull: float, reach: float, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Chooses starts from which the ways to the targets have a given length.
+    """Chooses starts from which the paths to the targets have a given length.
 
-    Starts keep the distances of `gaps_of` from each other and from the targets of other robots. A
-    robot that finds no such start gets one with another way, or one without room if there is none.
+    Starts keep the distances of `gaps_of` from each other and from the targets of other robots. If
+    a robot finds no such start, it gets one with another path length, or else one without room.
 
     Args:
       level: the level as drawn, a `level.Level`.
-      distance: [2] smallest and largest way, units. A level draws one way for all of its robots.
+      distance: [2] shortest and longest path, units. All robots of a level get the same length.
       hull: radius of the robots, m.
       reach: radius of the arrival zone, m.
       xp: `numpy` or `jax.numpy`; both choose the same starts.
 
     Returns:
-      [R, 2] x and y of the starts, units; [R] whether their ways have the drawn length; and []
-      whether all of them keep the least distances to everything else.
+      [R, 2] x and y of the starts, units; [R] whether their paths have the drawn length; and []
+      whether all starts keep the least distances to everything else.
     """
     side, rectangle = units(level.side, xp), _rectangles(level, xp)
     number = xp.arange(len(level.target))
@@ -138,11 +138,11 @@ def _points(shift: Array, side: Array, xp: Any) -> Array:
 def _candidates(
     plan: Plan, robot: Array, way: Array, least: int, xp: Any
 ) -> tuple[Array, Array, Array]:
-    """Lists possible starts of a robot: points moved along their ways, and the points themselves.
+    """Lists possible starts of a robot: points moved along their paths, and the points themselves.
 
     Returns:
-      The starts [2 P, 2], whether they have the way, and whether they have any way of at least
-      `least`.
+      The starts [2 P, 2], whether their paths have the length `way`, and whether they have any
+      path of at least the length `least`.
     """
     place = xp.concatenate([plan.target[robot][None], plan.corner])
     legs = xp.concatenate([plan.to_target[:, robot][:, None], plan.to_corner], axis=1)
@@ -171,7 +171,7 @@ def _rectangles(level: Any, xp: Any) -> Array:
 
 
 def _plan(level: Any, points: Array, rectangle: Array, hull: float, xp: Any) -> Plan:
-    """Measures all legs, and the shortest ways from the corners."""
+    """Measures all legs, and the shortest paths from the corners."""
     there, target = level.obstacle_present, units(level.target, xp)
     off, widened = round(_CORNER * hull * UNITS), round(_WIDENED * hull * UNITS)
     corner = rectangle[:, None, :2] + _SIGNS * (rectangle[:, None, 2:] + off)
@@ -195,10 +195,10 @@ def _plan(level: Any, points: Array, rectangle: Array, hull: float, xp: Any) -> 
 
 
 def _settle(to_go: Array, between: Array, xp: Any) -> Array:
-    """Shortens ways [R, K] by legs between corners [K, K] until no way gets shorter."""
+    """Shortens paths [R, K] by legs between corners [K, K] until no path gets shorter."""
 
     def shorten(to_go: Array) -> Array:
-        # One Bellman-Ford step allows ways with one more corner.
+        # One Bellman-Ford step allows paths with one more corner.
         further = xp.min(between + to_go[:, None, :], axis=-1, initial=_NO_WAY)
         return xp.minimum(to_go, further)
 
@@ -217,7 +217,7 @@ def _settle(to_go: Array, between: Array, xp: Any) -> Array:
 
 
 def _legs(begin: Array, end: Array, rectangle: Array, there: Array, widened: int, xp: Any) -> Array:
-    """Measures straight legs [B, E] from points to others; `_NO_WAY` where a wall bars them.
+    """Measures straight legs [B, E] from points to others; `_NO_WAY` where a wall blocks them.
 
     A large table is made in blocks of rows. With whole tables, 20,480 arenas with mazes of 6 x 6
     cells took 233 GiB of a GPU's memory.
@@ -241,8 +241,8 @@ def _block(
 
     The test uses separating axes (Ericson 2005, "Real-Time Collision Detection", section 5.3.3).
     """
-    # Twice the middle of the leg, and the leg. In an arena of 4 m they are at most 2**15 and 2**14
-    # from a wall's centre, so an int32 holds the sum of two products.
+    # `middle` is twice the middle of the leg. In an arena of 4 m, twice the middle is at most 2**15
+    # from a wall's, and the leg at most 2**14 long, so an int32 holds the sum of two products.
     middle, across = begin[:, None] + end[None], end[None] - begin[:, None]
     centre, half = 2 * rectangle[:, :2], 2 * (rectangle[:, 2:] + widened)
 
@@ -255,13 +255,13 @@ def _block(
         return barred | (meets & there[i])
 
     barred = repeat(len(rectangle), is_barred, xp.zeros((len(begin), len(end)), bool), xp)
-    # Squares of distances to parking places may overflow; no way leads there.
+    # Squares of distances to parking places may overflow; no path leads there.
     square = xp.maximum(xp.sum(across * across, axis=-1, dtype=xp.int32), 0)
     return xp.where(barred, _NO_WAY, _root(square, xp))
 
 
 def _root(square: Array, xp: Any) -> Array:
-    """Returns the integer part of the square root, which rounding of `sqrt` does not change."""
+    """Returns the integer part of the square root, whatever the rounding error of `sqrt`."""
     root = xp.floor(xp.sqrt(square.astype(xp.float32))).astype(xp.int32)
     root = root - (root * root > square)
     return root + ((root + 1) * (root + 1) <= square)

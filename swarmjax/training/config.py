@@ -33,8 +33,8 @@ class ProgramConfig(Section):
         "number of runs trained at once, with seeds seed, seed + 1, ...",
         1,
         4096,
-        reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
-        "a second run, with seed=4096",
+        reason="a call of the compiled program reports one row per seed, at most 4096. Train more "
+        "in a second run, with seed=4096",
     )
     seeds_by: Literal["vmap", "cores", "devices"] = setting(
         "vmap",
@@ -51,7 +51,7 @@ class ProgramConfig(Section):
     )
     streams: int | None = setting(
         None,
-        "number of random streams, a multiple of devices; runs with as many streams draw the same "
+        "number of random streams, a multiple of devices; runs with equal streams draw the same "
         "random numbers on any number of devices; null: one for each device that shares the arenas",
         1,
         2**16,
@@ -60,7 +60,7 @@ class ProgramConfig(Section):
     levels_per_rollout: int | None = setting(
         None,
         "levels drawn for each arena before a rollout; an arena that needs more repeats the last "
-        "level, and no success counts these repeats; null: one for every 32 control steps",
+        "level, and success does not count these repeats; null: one for every 32 control steps",
         1,
         1024,
     )
@@ -70,7 +70,7 @@ class ProgramConfig(Section):
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
-        metadata=about("digest of each part of extensions in use, by kind and name", derived=True),
+        metadata=about("digest of each extension piece in use, by kind and name", derived=True),
     )
 
     @property

@@ -1,7 +1,7 @@
-"""What robots are asked to do: `task.goal` names one.
+"""Goals: what robots are asked to do. `task.goal` names the goal.
 
 - goal.py: what every goal defines, and when episodes end; start here.
 - navigate.py, lifelong.py, gather.py, cover.py: the built-in goals.
 
-A goal of one's own is an extension; see `swarmjax.extension.goal`.
+To add a goal, write an extension; see `swarmjax.extension.goal`.
 """

@@ -2,7 +2,7 @@
 
 Each robot senses distance and bearing of the middle of all other robots, as a range-and-bearing
 board or a camera gives them; no place is agreed on. Robots have gathered when all centres lie in a
-disc around their middle. The disc is four times as large as all hulls together.
+disc around their middle. The disc has four times the area of all hulls together.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from swarmjax.task.level import Level
 from swarmjax.task.observation import View
 
 Array = Any
-# Robots whose hulls are closer than this belong to one cluster, in hull radii.
+# Largest gap between neighbouring hulls of a cluster, in hull radii.
 _LINK = 2.0
 
 

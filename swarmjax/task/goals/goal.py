@@ -1,9 +1,8 @@
-"""The seam between environment and goal: where targets are, who has arrived, what is measured.
+"""The interface between environment and goal: where targets are, who has arrived, what is measured.
 
 Training and the judge in MuJoCo C call a goal in the same way, with JAX arrays of one arena or with
 NumPy arrays of many. A goal takes the array module from its arguments and indexes axes from the
-end, so one text serves both. A goal of an extension need not: it always gets JAX arrays of one
-arena.
+end, so the same code serves both. A goal of an extension always gets JAX arrays of one arena.
 """
 
 from collections.abc import Mapping
@@ -18,18 +17,18 @@ End = Literal["each", "all", "never"]
 ENDS = get_args(End)
 State = Any  # an array, or a tuple of them
 
-# How the metrics of training name a goal's own measures: with this before the name.
+# Prefix of the goal's own measures in the metrics of training.
 MEASURED = "measured_"
 
 
 class Measure(NamedTuple):
-    """A figure with one number per level.
+    """A measure with one value per level.
 
     Attributes:
       label: Name of the measure in a table.
-      unit: Unit of the number. `%` means a share of 0 to 1 that is shown in per cent. A count has
+      unit: Unit of the value. `%` means a share of 0 to 1 that is shown in per cent. A count has
         no unit.
-      is_good: Whether larger numbers are better.
+      is_good: Whether larger values are better.
     """
 
     label: str
@@ -38,7 +37,7 @@ class Measure(NamedTuple):
 
 
 class GoalSizes(NamedTuple):
-    """Numbers of the settings that goals may use.
+    """Settings that goals may use.
 
     Attributes:
       control_step: s.
@@ -56,14 +55,14 @@ class GoalSizes(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """What a goal says after a control step.
+    """A goal's answer after a control step.
 
     Attributes:
       state: the goal's state for the next step.
       target: [..., R, 2] where each robot's target is from now on, m.
       arrived: [..., R] whether the robot has arrived, bool. Success is the share of these robots.
-      earns: [..., R] whether the robot earns the reward `arrival`, bool; None: as episodes end.
-      measured: value so far of each of the goal's `measures`, [...] by name.
+      earns: [..., R] whether the robot earns the reward `arrival`, bool; None: as `terminates`.
+      measured: current value of each of the goal's `measures`, [...] by name.
     """
 
     state: State
@@ -74,15 +73,15 @@ class Turn(NamedTuple):
 
 
 class Goal:
-    """A goal. This one never changes the targets, and is reached once all robots are at theirs.
+    """A goal. This base class never changes the targets, and ends once all robots are at theirs.
 
     Attributes:
       ends: what ends before the time is out. `each`: a robot that arrives stops for good, and
         the episode is over when all have. `all`: the episode is over when all robots have arrived
         in the same control step. `never`: nothing ends.
       moves: whether targets may change within an episode.
-      measures: figures of its own, by name.
-      sizes: numbers of the settings.
+      measures: the goal's own measures, by name.
+      sizes: settings that the goal may use.
     """
 
     ends: End = "all"
@@ -97,25 +96,25 @@ class Goal:
         return (), level.target
 
     def advance(self, state: State, level: Level, view: View) -> Turn:
-        """Says where the robots stand after a control step.
+        """Returns the goal's answer to a control step.
 
         Args:
           state: from `begin` or from the turn before.
           level: the level, with the targets of this step.
-          view: the arena after the step; `view.arrived` is that before the step.
+          view: the arena after the step, except `view.arrived`, which is from before the step.
         """
         del level
         return Turn(state, view.target, view.present & self.is_near(view))
 
     def turn(self, state: State, level: Level, view: View) -> Turn:
-        """Advances; with `ends="each"`, a robot that has arrived stays arrived."""
+        """Calls `advance`; with `ends="each"`, a robot that has arrived stays arrived."""
         found = self.advance(state, level, view)
         if self.ends != "each":
             return found
         return found._replace(arrived=view.arrived | found.arrived)
 
     def is_near(self, view: View) -> Array:
-        """Returns whether each robot [..., R] is within its target."""
+        """Returns whether each robot [..., R] is within `target_radius` of its target."""
         return view.distance <= self.sizes.target_radius
 
     def drives(self, arrived: Array) -> Array:
@@ -133,7 +132,7 @@ class Goal:
         return over & False if self.ends == "never" else over
 
     def terminates(self, before: Array, arrived: Array, present: Array) -> Array:
-        """Returns for which robots [..., R] nothing more can be earned after a control step."""
+        """Returns for which robots [..., R] this control step is the last that can earn reward."""
         if self.ends == "each":
             return arrived & ~before
         return present & self.is_over(arrived, present)[..., None]
@@ -141,7 +140,7 @@ class Goal:
     def measured(self, turn: Turn) -> Array:
         """Returns the measures of a turn in the order of `measures`, [..., K] float32.
 
-        A number that is not finite, which no file could hold, becomes 0.
+        Numbers that are not finite become 0, because the files of a run cannot hold them.
         """
         xp = turn.arrived.__array_namespace__()
         none = xp.zeros((*turn.arrived.shape[:-1], 0), xp.float32)

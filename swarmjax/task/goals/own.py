@@ -16,15 +16,15 @@ from swarmjax.task.goals.goal import ENDS, Goal, Measure, Turn
 from swarmjax.task.level import Level
 from swarmjax.task.observation import View
 
-# What a goal leaves as it is: judge and training would not agree otherwise.
+# Methods that a goal must not override, because judge and training would no longer agree.
 _FIXED = ("turn", "drives", "is_under_way", "is_over", "terminates", "measured")
 
 
 class SideBySide(Goal):
-    """A goal of an extension, for the judge: NumPy arrays of many arenas in and out."""
+    """A goal of an extension, for the judge: takes and returns NumPy arrays of many arenas."""
 
     def __init__(self, own: Goal) -> None:
-        """Takes the goal."""
+        """Wraps the goal of the extension."""
         super().__init__(own.sizes)
         self.ends, self.moves, self.measures = own.ends, own.moves, own.measures
         self._begin = jax.jit(jax.vmap(own.begin))
@@ -50,7 +50,7 @@ def check(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles
       obstacles: M.
 
     Raises:
-      ConfigError: something is wrong; the message says what is right.
+      ConfigError: the goal is invalid; the message says how to correct it.
     """
     name = extended.label(piece)
     _check_class(name, goal)
@@ -71,7 +71,7 @@ def check(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles
 
 
 def _check_class(name: str, goal: Goal) -> None:
-    """Refuses a class that measures nothing, or changes what both engines share."""
+    """Refuses a class that measures nothing, or overrides a method of `_FIXED`."""
     measures = goal.measures
     if not measures or not all(isinstance(each, Measure) for each in measures.values()):
         raise ConfigError(
@@ -85,7 +85,7 @@ def _check_class(name: str, goal: Goal) -> None:
 
 
 def _check_shapes(name: str, first: Any, turn: Turn, robots: int) -> None:
-    """Refuses a turn with arrays of other shapes or types."""
+    """Refuses a turn whose arrays have wrong shapes or types."""
     place, each = ((robots, 2), jnp.float32), ((robots,), bool)
     wanted = {"target of begin": (first, *place), "target": (turn.target, *place)}
     wanted |= {"arrived": (turn.arrived, *each)}

@@ -1,8 +1,8 @@
 """Walls that stand between starts and targets: a trap, a fence, a door, and two corridors.
 
 A trap is a U-shaped wall that opens towards the robots, with the targets behind it. A fence starts
-at one side of the arena and leaves a way around its end. A door joins two halls for one robot at a
-time, with robots going both ways. Corridors are for one robot at a time. One has a bay, where one
+at one side of the arena and leaves a way around its end. A door joins two halls, and robots pass it
+one at a time, in both directions. Corridors are for one robot at a time. One has a bay, where one
 robot lets the other pass. The other is a dead end, with targets one behind the other.
 """
 
@@ -152,7 +152,7 @@ def draw_door(uniforms: Array, site: Site, xp: Any) -> Drawn:
     most = xp.maximum(half_y - aside - jamb, 0)
     door = pick(position[1], -most, most, xp)
     halls = [_hall(site, where, side, shifts, xp) for side in (-1, 1)]
-    away = Gap(site.numbers.apart, site.numbers.apart)  # kept even where there is little room
+    away = Gap(site.numbers.apart, site.numbers.apart)  # hard: kept even in a small hall
     middle = xp.stack([where, door])[None]
     right = np.arange(count) % 2 == 0
     going = (site.present & right, site.present & ~right)

@@ -1,4 +1,4 @@
-"""Draws levels of layouts: draws numbers, lays out an arena, turns it, converts it to metres."""
+"""Draws levels of layouts: draws lengths, lays out an arena, turns it, converts it to metres."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ _BARS = 2  # walls that make an arena narrower than it is long
 
 
 class LayoutArrays(NamedTuple):
-    """Numbers of one layout in all stages, [S, ...], or in one stage, [...].
+    """Ranges of one layout's lengths in all stages, [S, ...], or in one stage, [...].
 
     Attributes:
       chosen: whether the stage has this layout, bool.
@@ -34,7 +34,7 @@ class LayoutArrays(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """The part of a layout that is compiled in.
+    """A layout, with its settings that are fixed at compile time.
 
     Attributes:
       name: name in `LAYOUTS`.
@@ -88,12 +88,12 @@ def draw(
     reach: float,
     xp: Any,
 ) -> tuple[Array, Drawn]:
-    """Lays an arena out.
+    """Draws an arena of a layout.
 
     Args:
-      kind: the compiled part.
-      of: numbers of the layout in one stage, in fields [...].
-      uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
+      kind: the layout, with its settings that are fixed at compile time.
+      of: ranges of the layout's lengths in one stage.
+      uniforms: [uniform_count(kind, R) or more] float32 in [0, 1); the only source of randomness.
       present: [R] whether the robot is present.
       hull: radius of the robots, m.
       reach: distance at which a robot has arrived, m.

@@ -60,7 +60,7 @@ def in_cells(ranked: Array, aside: Array, site: Site, wall: int, xp: Any) -> tup
     """Places starts and targets in cells of their own, at random within the cells.
 
     Args:
-      ranked: [C] cells, those to use first.
+      ranked: [C] indices of cells; the first ones are used.
       aside: [4 R] uniform numbers in [0, 1).
       site: the arena.
       wall: how far walls reach into a cell, units.

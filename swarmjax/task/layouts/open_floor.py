@@ -1,4 +1,4 @@
-"""Arenas without walls: robots on a circle, each with its target on the opposite side, and a crowd.
+"""Arenas without inner walls: a circle, with each target on the opposite side, and a crowd.
 
 The robots of a crowd start anywhere outside the arrival zones. Its targets keep the distance
 `apart` while there is room. A target that finds no such place takes the point farthest from the

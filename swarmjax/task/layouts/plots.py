@@ -1,9 +1,9 @@
 """Arenas of hundreds of robots: each box, start and target has a plot of its own.
 
-Other levels place objects one after the other, clear of all before. Their time grows with the
-square of the number of robots, and their points are too few for a thousand. Here the arena is
-divided into a square grid of plots, which are dealt out at random. An object lies at random in the
-middle of its plot, as far from the edges as objects must be apart.
+Other levels place objects one after the other, clear of all earlier ones. This takes time that
+grows with the square of the number of robots, on too few points for a thousand robots. Here the
+arena is divided into a square grid of plots, which are dealt out at random. An object lies at
+random in its plot, but so far from the edges that it keeps its distance from other objects.
 """
 
 import math
@@ -33,7 +33,7 @@ def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      The layout; boxes are turned by 0 degrees.
+      The layout; boxes are not turned.
     """
     robots, boxes = site.present.shape[0], site.cells
     count, objects = along(robots, boxes), 2 * robots + boxes

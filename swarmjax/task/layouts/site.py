@@ -83,7 +83,7 @@ class ArenaLayout(NamedTuple):
       uniforms: takes a number of robots and cells, and returns how many uniform numbers the layout
         takes.
       walls: takes the number of cells of a site, and returns the largest number of walls.
-      reads: those `NUMBERS` of a stage that the layout uses, or `cells`.
+      reads: names of the `NUMBERS` that the layout uses, or `cells`.
       most_robots: largest number of robots, however large the arena.
       square: whether the arena must be square.
     """
