@@ -11,13 +11,13 @@ from swarmjax.sim import sensors
 # 0.41 m wide, a tenth of the side of a 4 m arena.
 LARGEST_HULL = 0.15
 _HULL_REASON = (
-    "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
+    "passages are 2.7 hull radii wide, and an arena of 4 m would hold few of them"
 )
 # Within these limits, MuJoCo's geometry and float32 work in arenas of 0.4 to 4 m. For comparison,
 # an e-puck drives at 0.13 m/s.
 LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of all settings that code divides by
 _FASTEST = 5.0  # m/s
-_SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
+_SPEED_REASON = "a faster robot crosses an arena of 4 m in less than a second"
 _FASTEST_TURN = 50.0  # rad/s
 _TURN_REASON = "a faster turn makes more than one rotation in a control step of 0.128 s"
 FASTEST_WHEEL = 1000.0  # rad/s
