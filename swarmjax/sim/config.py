@@ -10,9 +10,7 @@ from swarmjax.sim import sensors
 # m; wider hulls make wider passages (`passage` in task/stage_config.py). A passage for this hull is
 # 0.41 m wide, a tenth of the side of a 4 m arena.
 LARGEST_HULL = 0.15
-_HULL_REASON = (
-    "passages are 2.7 hull radii wide, and an arena of 4 m would hold few of them"
-)
+_HULL_REASON = "passages are 2.7 hull radii wide, and an arena of 4 m would hold few of them"
 # Within these limits, MuJoCo's geometry and float32 work in arenas of 0.4 to 4 m. For comparison,
 # an e-puck drives at 0.13 m/s.
 LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of all settings that code divides by

@@ -193,5 +193,5 @@ def test_the_largest_hull_has_a_reason():
     sentence = refusal(load_train, ["robot.hull_radius=0.2"])
     assert sentence == (
         "robot.hull_radius is 0.2: give more than 0, at most 0.15; passages are 2.7 hull radii "
-        "wide, and an arena of at most 4 m would hold few of them."
+        "wide, and an arena of 4 m would hold few of them."
     )
