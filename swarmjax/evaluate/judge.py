@@ -183,7 +183,7 @@ def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
     taken = sorted({*goal.measures} & {*MEASURES})
     if taken:
         raise ConfigError(
-            f"goal {config.task.goal} measures {', '.join(taken)}, which are built in: rename them."
+            f"goal {config.task.goal} defines {', '.join(taken)}, which is built in: rename it."
         )
     own_goals.check(own[0], goal, config.robot, config.stage.robots, config.stage.obstacles)
     return own_goals.SideBySide(goal)

@@ -143,7 +143,7 @@ def raster(data: Reproduction, arms: tuple[str, ...], *, axis: Axis, stage: str 
 
     Args:
       data: the reproduction's data.
-      arms: finished arms; each gets two panels, one per reading of success.
+      arms: finished arms; each gets two panels, one per definition of success.
       axis: unit of the horizontal axis.
       stage: shows only the episodes of this stage; None for all.
     """

@@ -182,7 +182,7 @@ def crowding(data: Reproduction, arm: str, *, stage: str) -> np.ndarray:
       stage: the stage. Of the last `WINDOW` episodes, those with two or more arrivals are used.
 
     Returns:
-      [N] mean difference of a seed's episodes, robot steps; nan for a seed without such an episode.
+      [N] difference in robot steps, mean over the seed's episodes that are used; nan if none is.
     """
     differences = []
     for log in data.logs[arm]:

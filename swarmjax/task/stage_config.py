@@ -98,8 +98,8 @@ class StageConfig(Section):
     layout: Literal["boxes", "fence"] = setting("boxes", "obstacles of level=fixed")
     map: tuple[str, ...] = setting(
         (),
-        "arena as rows of text: # wall, . floor, S start area, T target area, another letter: "
-        "start of one robot, its capital: target; sets side, obstacles and level",
+        "rows of text that draw the arena: # wall, . floor, S start area, T target area, another "
+        "small letter a robot's start, its capital the target; sets side, obstacles and level",
     )
     cell: float = setting(0.12, "edge of a map cell, m", _SMALLEST_CELL, 1.0)
     breadth: _Length = setting(
@@ -115,7 +115,7 @@ class StageConfig(Section):
     length: _Length = setting(None, "length of a fence or a bay, m, or a range", 0.1, 4.0)
     radius: _Length = setting(None, "radius of the circle of starts, m, or a range", 0.1, 1.9)
     apart: _Length = setting(
-        None, "distance between targets, or from targets to a door, m, or a range", 0.05, 1
+        None, "distance (m, or a range) between targets, or from targets to a door", 0.05, 1
     )
     cells: int | None = setting(None, "cells along a side of level=maze or blocks", 2, 8)
 
