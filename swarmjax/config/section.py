@@ -131,7 +131,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
     Args:
       section: the settings.
       options: for each option, the key that decides whether it is read, and the values of that key
-        with which it is. With other values, the option must have its default.
+        with which it is read. With other values, the option must have its default.
 
     Raises:
       ConfigError: an option has another value than its default, and is not read.
@@ -148,7 +148,7 @@ def check_options(section: Section, options: Mapping[str, tuple[str, Sequence[st
 
 
 class ByName(dict[str, Any]):
-    """A mapping to values from names that no section defines.
+    """A mapping from names to values, where no section defines the names.
 
     It is never changed, so that settings are hashable.
     """
@@ -253,7 +253,7 @@ def convert(hint: object, value: object, key: str) -> object:
 
 
 def _listed(hint: object, value: object, key: str) -> tuple[object, ...]:
-    """Converts a list of values of one type. One of several sections is called by its own name."""
+    """Converts a list of values of one type. Messages call each of several sections by its name."""
     if not isinstance(value, list | tuple):
         raise ConfigError(f"{key} is {show(value)}: give {values.describe(hint)}.")
     inner = typing.get_args(hint)[0]

@@ -1,8 +1,8 @@
-"""Curricula along axes: a stage, and easier values of its numbers, become a grid of stages.
+"""Curricula along axes: a stage and easier values of its keys become a grid of stages.
 
 With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
-an axis is the stage's own, so the last stage is the stage itself. From one
-stage to the next, the last axis changes fastest.
+an axis is the stage's own, so the last stage of the grid is the stage itself. From one stage to the
+next, the last axis changes fastest.
 """
 
 import itertools
@@ -26,7 +26,7 @@ def expand(stage: Mapping[str, Any], axes: Mapping[str, Any]) -> list[dict[str, 
 
     Args:
       stage: plain data of the stage that becomes the last one.
-      axes: values of each axis, from easy to hard, without the stage's own value.
+      axes: for each axis, values from easy to hard; the stage's own value is left out.
 
     Returns:
       Plain data of the stages; the last one is `stage`.

@@ -21,21 +21,21 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
-    """Settings: which arenas train on which stage, when that changes, and what a promotion changes.
+    """Settings: which arenas train on which stage, when that changes, and what a promotion resets.
 
     Some options are read only by some modes. Their texts end with these modes, in brackets.
     """
 
     mode: str = setting(
         "mixed",
-        "sequential: all arenas on the newest stage; mixed: most on the newest, some on earlier "
-        "stages; adaptive: on all stages, more on those with a higher score; frontier: on stages "
-        "whose easier neighbours are learned; or the name of an extension's curriculum",
+        "where arenas train; sequential: all on the newest stage; mixed: most on the newest, some "
+        "on earlier stages; adaptive: on all stages, more on those with a higher score; frontier: "
+        "on stages whose easier neighbours are learned; or the name of an extension's curriculum",
     )
     axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
         default_factory=ByName,
         metadata=about(
-            "easier values of the stage's numbers: a list from easy to hard for each name; each "
+            "easier values of the stage's keys: for each key a list from easy to hard; each "
             "combination becomes a stage, and mode is frontier unless given"
         ),
     )
@@ -46,37 +46,37 @@ class CurriculumConfig(Section):
     )
     threshold: float | tuple[float, ...] = setting(
         0.8,
-        "success at which a stage is learned: one number, or a list with one for each stage "
-        "[sequential, mixed, frontier]",
+        "success from which a stage counts as learned: one number, or a list with one per stage "
+        "[mode=sequential, mixed or frontier]",
         0.0,
         1.0,
     )
     budget_share: float = setting(
         0.5,
-        "share of the budget for all stages before the last, divided equally [sequential, mixed]",
+        "budget share of all stages before the last, in equal parts [mode=sequential or mixed]",
         above=0.0,
         below=1.0,
     )
     score: Literal["learnability", "failure"] = setting(
         "learnability",
-        "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]",
+        "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [mode=adaptive]",
     )
     floor: float = setting(
         0.1,
-        "share of the arenas that is spread evenly over all stages [adaptive, frontier]",
+        "share of the arenas that is spread evenly over all stages [mode=adaptive or frontier]",
         above=0.0,
         high=1.0,
     )
     shares: Literal["arenas", "robots"] = setting(
         "arenas",
-        "what the stages' weights are shares of; robots: a stage with many robots gets fewer "
-        "arenas, so that the numbers of samples follow the weights [adaptive]",
+        "what to share out by the stages' weights; robots: a stage with many robots gets fewer "
+        "arenas, so that its share of samples equals its weight [mode=adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
-        "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
+        "keep", "Adam's moments after a promotion; reset: 0 [mode=sequential or mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep", "exploration after a promotion; reset: from algo.initial_std [sequential, mixed]"
+        "keep", "exploration after a promotion; reset: as at first [mode=sequential or mixed]"
     )
 
     def _check(self) -> None:

@@ -11,15 +11,15 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.stage_config import StageConfig
 
-# What a judge's robot has unless a robot file or a word says otherwise. Hulls rub on hulls, boxes
-# and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
+# The robot's settings in an evaluation, unless a robot file or an argument sets them. Hulls rub on
+# hulls, boxes and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
 JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
-STEPS = 1500  # control steps of an episode by default; Table 1
+STEPS = 1500  # control steps of an episode by default; Table 1 of the paper
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
-# Values that `trained_settings.load` takes from the policies.
+# What `trained_settings.load` takes from the policies, as `--help` shows it.
 AS_TRAINED = {
-    "stage": "its last stage",
+    "stage": "the policy's last stage",
     "robot": "as trained, on wheels and with hulls of friction 1",
     "task": "as trained",
     "realism": "as trained",
@@ -28,7 +28,7 @@ AS_TRAINED = {
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeConfig(Section):
-    """The settings of all commands that judge policies: the levels, the robots and the world."""
+    """The settings shared by commands that evaluate policies: levels, robots and the world."""
 
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
@@ -36,23 +36,23 @@ class JudgeConfig(Section):
     robot: RobotConfig = field(default_factory=lambda: RobotConfig(**JUDGED))
     task: TaskConfig = field(default_factory=TaskConfig)
     suite: str | None = setting(
-        None, "instead of a stage: a name in configs/suites/, or a .yaml or .npz file"
+        None, "instead of stage, a suite: its name in configs/suites/, or a .yaml or .npz file"
     )
     realism: RealismConfig = field(default_factory=RealismConfig)
     action: Literal["sampled", "mean"] = setting(
         "sampled",
-        "robots' actions; sampled: drawn from the policy, the same for the same level; mean: "
-        "the policy's most likely action",
+        "sampled: sample actions from the policy, with random numbers that the level fixes; mean: "
+        "take the policy's most likely action",
     )
     steps: int | None = setting(
         None,
-        f"control steps of an episode; null: as in the suite's cell, else {STEPS} (Table 1)",
+        f"control steps of an episode; null: as the suite's cell says, else {STEPS}",
         1,
         MOST_STEPS,
     )
-    episodes: int = setting(1000, "episodes", 1, MOST_EPISODES)
+    episodes: int = setting(1000, "number of episodes", 1, MOST_EPISODES)
     seed: int = setting(1, "random seed of the levels", 0, MAX_COUNT)
-    workers: int | None = setting(None, "processes; null: one per core", 1, 1024)
+    workers: int | None = setting(None, "number of processes; null: one per core", 1, 1024)
     substeps: int | None = setting(
         None, "physics steps per control step; null: the body's default", 1, 1000
     )
@@ -62,7 +62,7 @@ class JudgeConfig(Section):
 
     @property
     def step_limit(self) -> int:
-        """Control steps of an episode, unless a cell of a suite has its own number of steps."""
+        """Control steps of an episode, unless a suite's cell sets its own number."""
         return STEPS if self.steps is None else self.steps
 
     def _check(self) -> None:
@@ -71,15 +71,15 @@ class JudgeConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(JudgeConfig):
-    """All settings of an evaluation of policies."""
+    """All settings of an evaluation."""
 
     command: ClassVar[str] = "evaluate"
 
     policy: str | None = setting(
-        None, "policy.npz, or several seeds of a recipe: a.npz,b.npz or a pattern"
+        None, "policy file; for several seeds of a recipe, a.npz,b.npz or a pattern"
     )
     compare: str | None = setting(
-        None, "two recipes instead, compared level by level: a.npz,b.npz, or patterns"
+        None, "instead of policy, two recipes to compare level by level: a.npz,b.npz or patterns"
     )
     engine: Literal["c", "mjx"] = setting("c", "c: MuJoCo's C engine; mjx: the engine of training")
     out: str | None = setting(None, "folder for result.json and levels.csv, or a single .json file")

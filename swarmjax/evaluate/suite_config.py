@@ -1,4 +1,4 @@
-"""Files of suites: cells of levels to judge policies on."""
+"""Suite files: each lists cells, which are sets of levels to evaluate policies on."""
 
 import re
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ SUITE_SEED = 1_000_000
 class CellConfig(Section):
     """Levels of one kind in a suite."""
 
-    name: str = field(metadata=about("of the cell"))
+    name: str = field(metadata=about("name of the cell"))
     stage: StageConfig
-    levels: int = setting(1000, "how many", 1, 1_000_000)
-    seed: int = field(metadata=about("of the levels", SUITE_SEED, MAX_COUNT))
+    levels: int = setting(1000, "number of levels", 1, 1_000_000)
+    seed: int = field(metadata=about("seed of the levels", SUITE_SEED, MAX_COUNT))
     episodes: tuple[int, ...] = setting(
-        (), "numbers of the levels; empty: 0 to levels - 1", 0, MAX_COUNT
+        (), "index of each level to draw; empty: 0 to levels - 1", 0, MAX_COUNT
     )
     realism: Literal["ideal", "webots", "real"] | None = setting(
-        None, "preset; null: the command's"
+        None, "realism preset; null: as set for the command"
     )
     steps: int | None = setting(
         None, "control steps of an episode; null: as set for the command", 1, MOST_STEPS
@@ -48,7 +48,7 @@ class CellConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteFileConfig(Section):
-    """A suite: levels for judging policies, never for training."""
+    """A suite: levels to evaluate policies on, never to train on."""
 
     name: str = field(metadata=about("name of the suite, equal to the name of its file"))
     cells: tuple[CellConfig, ...]
@@ -69,7 +69,7 @@ def read_suite(choice: str) -> SuiteFileConfig:
       choice: A name in configs/suites/, or the path of a .yaml file.
 
     Raises:
-      ConfigError: There is no such file, or it is unsound.
+      ConfigError: There is no such file, or it is invalid.
     """
     path = files.named_path("suites", choice, "suite")
     mapping = reading.read_yaml(path)
@@ -83,7 +83,7 @@ def read_suite(choice: str) -> SuiteFileConfig:
 
 
 def _cell(cell: Any, folder: Path) -> Any:
-    """Fills in the numbers of the stage that a cell names, perhaps with a file beside the suite."""
+    """Fills in the settings of a cell's stage; its name may be a file beside the suite."""
     stage = cell.get("stage") if isinstance(cell, Mapping) else None
     if isinstance(stage, str):
         stage = files.beside(folder, stage)

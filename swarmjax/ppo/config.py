@@ -8,7 +8,7 @@ from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.config.section import MAX_COUNT, check_options
 from swarmjax.extension import Network
 
-# Options that are read only with some choices of another key: by option, that key and the choices.
+# For each option that is read only with some values of another key: that key and these values.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
     "gae_lambda": ("advantage", ("gae",)),
     "memory_size": ("memory", ("gru",)),
@@ -27,7 +27,7 @@ class AlgoConfig(Section):
     """
 
     name: Literal["ppo", "paper"] = setting(
-        "ppo", "preset that gave the first values", derived=True
+        "ppo", "preset that the settings are based on", derived=True
     )
     policy: Literal["shared", "independent"] = setting(
         "shared", "shared: one policy for all robots; independent: one policy for each robot"
@@ -39,24 +39,25 @@ class AlgoConfig(Section):
     memory: Literal["none", "gru"] = setting(
         "none", "memory of the robots; gru: a gated recurrent unit after the hidden layers"
     )
-    memory_size: int = setting(64, "numbers in the memory of each network [memory=gru]", 1, 1024)
+    memory_size: int = setting(64, "size of the memory of each network [memory=gru]", 1, 1024)
     critic: Literal["observation", "state"] = setting(
         "observation",
-        "what the critic sees; state: also targets, other robots, walls, the distance to go "
-        "and the direction of the path, none of which the policy sees",
+        "what the critic sees; observation: the same as the policy; state: also where targets, "
+        "robots and walls are, and length and direction of the path to the target",
     )
     activation: Literal["tanh", "relu", "swish"] = setting(
         "tanh", "activation of the hidden layers"
     )
     mean_activation: Literal["linear", "tanh"] = setting(
         "linear",
-        "activation of the mean action; tanh: keeps the action within the range of the commands",
+        "activation of the mean action; tanh: keeps it within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
-        "orthogonal", "first weights; uniform: within +-1 / sqrt(inputs), biases too, as in PyTorch"
+        "orthogonal",
+        "first weights; uniform: within +-1 / sqrt(inputs), with biases, as in PyTorch",
     )
     normalize_observations: bool = setting(
-        True, "normalise observations by running mean and deviation; false: raw; both clip to +-10"
+        True, "normalise observations by running mean and deviation; clipped to +-10 in any case"
     )
     rollout_length: int = setting(32, "control steps of each arena per update", 1, MAX_COUNT)
     epochs: int = setting(1, "passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
@@ -66,8 +67,8 @@ class AlgoConfig(Section):
     )
     advantage: Literal["gae", "monte_carlo"] = setting(
         "gae",
-        "gae: bootstrapped, also at the step limit; monte_carlo: the critic and the advantages "
-        "use normalised returns up to the end of the episode or rollout",
+        "gae: bootstraps, also at the step limit; monte_carlo: critic and advantages use "
+        "normalised returns up to the end of the episode or rollout",
     )
     gae_lambda: float = setting(0.95, "GAE's lambda [advantage=gae]", 0.0, 1.0)
     clip_epsilon: float = setting(
@@ -75,8 +76,8 @@ class AlgoConfig(Section):
     )
     actor_learning_rate: float | None = setting(
         None,
-        "learning rate of the policy: 'optimizer learning rate actor'; null: 3e-4, but in a run of "
-        "more than 15000 gradient steps less, in inverse proportion to their number",
+        "learning rate of the policy: 'optimizer learning rate actor'; null: 3e-4, or "
+        "3e-4 * 15000 / N in a run of N > 15000 gradient steps",
         above=0.0,
         high=1.0,
     )
@@ -99,8 +100,8 @@ class AlgoConfig(Section):
     entropy_cost: float = setting(0.0, "weight of the entropy bonus", 0.0)
     update_backend: Literal["auto", "autodiff"] = setting(
         "auto",
-        "how to compute gradients; auto: by GPU kernels if these support the GPU and the layers; "
-        "with a memory, by autodiff that leaves out the rollouts of absent robots",
+        "how to compute gradients; auto: GPU kernels if they support the GPU and the layers; with "
+        "a memory, autodiff without the rollouts of absent robots",
     )
     exploration: Literal["learned", "scheduled"] = setting(
         "learned", "standard deviation of the action: learned, or falling in steps by a schedule"
@@ -153,7 +154,7 @@ def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
     """Returns the name of the network that a config selects.
 
     Args:
-      config: Names a network, or leaves the choice to the extension.
+      config: Settings; `network` names a network, or is None.
       networks: Networks of an extension.
 
     Raises:

@@ -29,12 +29,12 @@ class ReproduceConfig(Section):
 
     command: ClassVar[str] = "reproduce"
 
-    seeds: int = setting(10, "number of seeds of each arm", LEAST_DRAWN, 4096)
-    budget: int = setting(BUDGET, "control steps of a seed; with fewer: no verdicts", UPDATE, _MOST)
-    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded, at 1.5 m", UPDATE, _MOST)
+    seeds: int = setting(10, "number of seeds in each arm", LEAST_DRAWN, 4096)
+    budget: int = setting(BUDGET, "control steps of a seed; fewer give no verdicts", UPDATE, _MOST)
+    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded (1.5 m)", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
-        None, "save and stop after so many minutes; resume=DIR continues", above=0.0
+        None, "save and stop after this many minutes; resume=DIR continues", above=0.0
     )
     out: str | None = setting(None, "directory to write; null: runs/<date>-<time>-reproduce")
     resume: str | None = setting(None, "directory of the reproduction to continue")

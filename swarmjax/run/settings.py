@@ -18,7 +18,7 @@ class RunConfig(Section):
     id: str | None = setting(None, "random id, drawn when the run begins", derived=True)
     dir: str | None = setting(None, "run directory; null: runs/<date>-<time>-<stage>-seed<seed>")
     chunk: int | Literal["auto"] = setting(
-        "auto", "updates per call of the compiled program; auto: a second of them", 1, MAX_COUNT
+        "auto", "updates per call of the compiled program; auto: as many as take 1 s", 1, MAX_COUNT
     )
     checkpoint_minutes: float = setting(
         1.0, "minutes between checkpoints; 0: after every chunk", 0.0
@@ -28,17 +28,17 @@ class RunConfig(Section):
     )
     stop_at: float | None = setting(
         None,
-        "success of every seed on the last stage (curriculum.success) at which the run ends",
+        "end the run once every seed has this success on the last stage (curriculum.success)",
         above=0.0,
         high=1.0,
     )
-    verbose: bool = setting(False, "name the engine too")
+    verbose: bool = setting(False, "print the physics engine too")
     tensorboard: bool = setting(True, "write TensorBoard events")
     wandb: str | None = setting(None, "Weights & Biases project to log to; needs the extra wandb")
     episodes: bool = setting(False, "write each episode, robot by robot, to episodes.jsonl")
     distributed: bool = setting(
         False,
-        "train with other processes, which Slurm, Open MPI or Kubernetes names; elsewhere set "
+        "train with other processes, which Slurm, Open MPI or Kubernetes lists; elsewhere set "
         "JAX_COORDINATOR_ADDRESS (HOST:PORT), JAX_NUM_PROCESSES and JAX_PROCESS_ID",
     )
     deterministic: bool = setting(False, "make results on a GPU bit-for-bit repeatable; slower")
@@ -49,8 +49,8 @@ class TrainConfig(ProgramConfig):
     """All settings of a training run: what the program does, and where the run is written."""
 
     command: ClassVar[str] = "train"
-    # What is trained. Which code runs, where it is written, what it starts from and who is called
-    # is decided by whoever starts the run.
+    # What is trained. Whoever starts the run decides which code runs, where the run is written and
+    # what it starts from.
     shared: ClassVar[tuple[str, ...]] = (
         *("stage", "robot", "task", "realism", "algo", "curriculum", "sim"),
         *("arenas", "budget", "levels_per_rollout", "seed", "seeds", "streams"),
@@ -62,10 +62,10 @@ class TrainConfig(ProgramConfig):
     )
     run: RunConfig = field(default_factory=RunConfig)
     resume: str | None = setting(
-        None, "run directory to go on with; auto: run.dir, if it holds a run"
+        None, "run directory to continue; auto: run.dir, if it holds a run"
     )
     init_from: str | None = setting(
-        None, "run directory to take the first networks and normaliser from"
+        None, "run directory whose networks and normaliser training starts from"
     )
     stage_name: str = setting("", "name of the stage or of the curriculum", derived=True)
 

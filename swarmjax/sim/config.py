@@ -7,14 +7,14 @@ from swarmjax import epuck
 from swarmjax.config import ConfigError, Section, setting, show
 from swarmjax.sim import sensors
 
-# m; wider hulls make wider passages (`passage` in task/stage_config.py). A passage for this hull is
-# 0.41 m wide, a tenth of the largest arena's side.
+# m; a passage grows with the hull (`passage` in task/stage_config.py). For this hull it is 0.41 m
+# wide, a tenth of the side of a 4 m arena.
 LARGEST_HULL = 0.15
 _HULL_REASON = (
     "passages are 2.7 hull radii wide, and an arena of at most 4 m would hold few of them"
 )
-# Within these limits, MuJoCo's geometry and float32 work in arenas of 0.4 to 4 m. For comparison,
-# an e-puck drives at 0.13 m/s.
+# Within the limits below, float32 is precise enough for MuJoCo's geometry in arenas of 0.4 to 4 m.
+# For comparison, an e-puck drives at 0.13 m/s.
 LEAST = 0.001  # m, m/s, rad/s or friction; lower limit of all settings that code divides by
 _FASTEST = 5.0  # m/s
 _SPEED_REASON = "a faster robot crosses the largest arena, of 4 m, in less than a second"
@@ -37,7 +37,7 @@ class RobotConfig(Section):
     """Settings of the robot. The defaults are the e-puck's; epuck.py gives their sources."""
 
     body: Literal["planar", "wheeled"] = setting(
-        "planar", "planar: 3 degrees of freedom and servos; wheeled: a free body on wheels"
+        "planar", "planar: a disc that servos move; wheeled: a free body on wheels"
     )
     hull_radius: float = setting(
         epuck.HULL_RADIUS,
@@ -56,13 +56,13 @@ class RobotConfig(Section):
     )
     track: float = setting(
         epuck.TRACK,
-        "distance between the wheels for converting commands to wheel speeds, m",
+        "distance between the wheels, used to convert commands to wheel speeds, m",
         LEAST,
         2 * LARGEST_HULL,
     )
     effective_track: float | None = setting(
         None,
-        "distance between the points where the wheels grip, m; null: track",
+        "distance between the points where the wheels grip, m; null: same as track",
         LEAST,
         2 * LARGEST_HULL,
     )
@@ -77,7 +77,7 @@ class RobotConfig(Section):
     )
     hull_friction: float = setting(
         0.0,
-        "friction of hulls on hulls, boxes and walls; 0: they slide; Webots has 1",
+        "friction of a hull on other hulls, boxes and walls; 0: hulls slide; Webots: 1",
         0.0,
         MOST_HULL_FRICTION,
         reason=HULL_FRICTION_REASON,
@@ -90,7 +90,7 @@ class RobotConfig(Section):
         reason=_SPEED_REASON,
     )
     wheel_limit: Literal["refuse", "clip"] = setting(
-        "refuse", "a max_speed beyond the wheels' speed limit: refuse it, or clip what is driven"
+        "refuse", "if the wheels cannot reach max_speed; refuse: an error; clip: they drive slower"
     )
     max_turn_rate: float = setting(
         epuck.MAX_TURN_RATE,
@@ -107,7 +107,7 @@ class RobotConfig(Section):
     sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
     sensor_height: float = setting(
         epuck.SENSOR_HEIGHT,
-        "height of the infrared sensors, within that of every hull, m",
+        "height of the infrared sensors above the floor, m; rays must meet other hulls",
         above=epuck.HULL_BOTTOM,
         below=epuck.HULL_TOP,
     )
@@ -116,7 +116,7 @@ class RobotConfig(Section):
     )
     sensor_response: tuple[sensors.Point, ...] = setting(
         epuck.INFRARED_TABLE,
-        "ray length (m), value and relative deviation, for realism.infrared=webots",
+        "ray length (m), counts and their relative noise, for realism.infrared=webots",
         0.0,
         sensors.MOST_VALUE,
     )
@@ -130,8 +130,8 @@ class RobotConfig(Section):
     def wheel_inertia(self) -> list[float]:
         """Moments of inertia of a wheel, kg m^2: the e-puck's, in proportion to the wheel's mass.
 
-        The values do not depend on the radius. About the axle, the motor's inertia is far larger
-        than the wheel's. About the upright axis, the body makes up the rest of `yaw_inertia`.
+        The values do not depend on the wheel's radius. About the axle, the motor's inertia is far
+        larger than the wheel's. About the upright axis, the body adds the rest of `yaw_inertia`.
         """
         return [self.wheel_mass / epuck.WHEEL_MASS * part for part in epuck.WHEEL_INERTIA]
 
@@ -184,11 +184,11 @@ class SimConfig(Section):
     )
     solver: Literal["auto", "mjx", "swarm"] = setting(
         "auto",
-        "contact solver; mjx: MJX's own step, unpatched; swarm: a step made for the "
-        "body, on wheels only with impl=warp; auto: swarm where available",
+        "contact solver; mjx: MJX's own; swarm: one written for these robots, with "
+        "body=wheeled only if impl=warp; auto: swarm where available",
     )
     max_robots: int | None = setting(
-        None, "robots to compile for; null: 5, or as many as the stages need", 1, 1024
+        None, "robots to compile for; null: as many as the stages need, at least 5", 1, 1024
     )
     max_obstacles: int | None = setting(
         None, "obstacles to compile for; null: as many as the stages need, at least 4", 0, 256

@@ -12,7 +12,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 # The value loss squares returns. With larger weights the squares could overflow float32.
 _MOST_WEIGHT = 1e6
-# The goal that reads an option.
+# By option: the key `goal`, and the goals that read the option.
 _READ_BY: dict[str, tuple[str, Sequence[str]]] = dict.fromkeys(
     ("arrival", "target_speed"), ("goal", ("navigate",))
 )
@@ -27,21 +27,21 @@ def _weight(default: float, meaning: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
-    """Weights of the reward terms: equation 3 of the paper, and penalties."""
+    """Weights of the reward terms: those of the paper's equation 3, and penalties."""
 
-    progress: float = _weight(1.0, "per metre nearer to the target")
+    progress: float = _weight(1.0, "per metre that the robot comes nearer to its target")
     path_progress: float = _weight(
-        0.0, "per metre nearer along the shortest path around walls and boxes"
+        0.0, "per metre by which the shortest path around walls and boxes gets shorter"
     )
     proximity: float = _weight(
-        0.0, "per control step before arrival with an object in infrared range"
+        0.0, "per control step before arrival in which an object is in infrared range"
     )
     arrival: float = _weight(
         0.0,
-        "once, on arrival; with arrival=hold and goal=gather, when all robots have arrived; "
-        "lifelong: at each target; cover: in each step that sees new floor",
+        "once, on arrival; arrival=hold or goal=gather: once all robots have arrived; "
+        "goal=lifelong: at each target; goal=cover: in each step in which the robot sees new floor",
     )
-    contact: float = _weight(-0.2, "per contact event of any kind")
+    contact: float = _weight(-0.2, "per contact that begins, of any kind")
     touching: float = _weight(0.0, "per control step in which the robot touches something")
     step_penalty: float = _weight(-0.002, "per control step that begins before arrival")
     extra: dict[str, float] = field(
@@ -54,7 +54,7 @@ class RewardConfig(Section):
 class TaskConfig(Section):
     """What a robot is asked to do, and what it observes."""
 
-    control_step: float = setting(0.032, "control step, s; Webots basicTimeStep", 0.001, 0.2)
+    control_step: float = setting(0.032, "control step, s; Webots' basicTimeStep", 0.001, 0.2)
     step_limit: int = setting(500, "control steps of a training episode", 1, MAX_COUNT)
     target_radius: float = setting(
         0.05,
@@ -69,12 +69,12 @@ class TaskConfig(Section):
         "extension's goal",
     )
     target_speed: float = setting(
-        0.0, "speed of the targets, which bounce off walls, m/s; 0: they stay [navigate]", 0.0, 0.2
+        0.0, "speed of targets, which bounce off walls, m/s; 0: at rest [goal=navigate]", 0.0, 0.2
     )
     arrival: Arrival = setting(
         "latch",
-        "latch: a robot that comes within its target stops for good; hold: it keeps driving, "
-        "and the episode is complete when all are within their targets at once [navigate]",
+        "latch: a robot that reaches its target stops for good; hold: it keeps driving, and the "
+        "episode ends when all robots are at their targets at once [goal=navigate]",
     )
     encoding: Literal["auto", "metric", "webots"] = setting(
         "auto",
@@ -82,7 +82,7 @@ class TaskConfig(Section):
         "realism.infrared=webots, else metric",
     )
     observations: tuple[str, ...] | None = setting(
-        None, "observations of extensions, in order; null: all of them"
+        None, "names of extension observations to use, in order; null: all"
     )
     reward: RewardConfig = field(default_factory=RewardConfig)
 
@@ -124,7 +124,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
       steps: number of control steps in an episode.
 
     Raises:
-      ConfigError: a setting is too large; the message names the full key.
+      ConfigError: a setting contradicts them; the message names the full key.
     """
     if realism.infrared == "real" and robot.sensor_poses != epuck.SENSOR_POSES:
         raise ConfigError(

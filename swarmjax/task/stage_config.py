@@ -24,10 +24,11 @@ from swarmjax.task.placement import UNITS
 DISC = 0.15  # m, edge of the square around the disc of a start or a target
 PASSAGE = 0.10  # m; between obstacles, and between an obstacle and a wall
 _DISC_PER_HULL, _PASSAGE_PER_HULL = 4.05, 2.7  # lengths per hull radius; as for the e-puck
-FILLING = 0.4  # share of a square grid's boxes that random placement is sure to place
+FILLING = 0.4  # share of a square grid's boxes that random placement can always place
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
-# Squares of lengths fit an int32, and points suffice, up to these numbers; plots go further.
+# Up to these numbers, squared lengths fit an int32 and there are enough points for all objects.
+# They do not apply to `plots`.
 _MOST_OBSTACLES, _MOST_ROBOTS, _LARGEST_SIDE = 112, 100, 4.0
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 _Length = float | tuple[float, float] | None
@@ -75,35 +76,35 @@ class StageConfig(Section):
     """One stage: number of robots, arena size and obstacles."""
 
     name: str = field(metadata=about("name of the stage: the name of its file"))
-    robots: int = field(metadata=about("active robots", 1, 1024))
+    robots: int = field(metadata=about("number of robots", 1, 1024))
     side: float | tuple[float, float] = field(
         metadata=about("side of the square arena, m; a range: each level draws a side", 0.4, 40.0)
     )
     distance: _Length = setting(
         None,
-        "way from start to target round walls, m, or a range; null: as the level has it",
+        "length of the path around walls from start to target, m, or a range; null: any",
         0.05,
         50.0,
     )
-    obstacles: int = setting(0, "obstacles; set by a layout but plots", 0, 256)
+    obstacles: int = setting(0, "number of obstacles; all layouts but plots set it", 0, 256)
     obstacle_size: float = setting(
-        0.10, "edge of the square boxes of a random level, or on plots, m", 0.02, 0.3
+        0.10, "edge of the square boxes of a random level or of plots, m", 0.02, 0.3
     )
     level: str = setting(
         "random",
-        "random: new in every episode; fixed: always the same; map: the walls of map, with "
+        "random: new in every episode; fixed: always the same; map: walls from the key map, with "
         f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
         "of an extension's level drawing",
     )
     layout: Literal["boxes", "fence"] = setting("boxes", "obstacles of a fixed level")
     map: tuple[str, ...] = setting(
         (),
-        "rows of the arena as text: # wall, . floor, S start area, T target area, a letter and "
-        "its capital for one robot; sets side, obstacles and level",
+        "rows of the arena as text: # wall, . floor, S start area, T target area; another letter: "
+        "start of one robot, its capital: target of that robot; sets side, obstacles and level",
     )
     cell: float = setting(0.12, "edge of a map cell, m", _SMALLEST_CELL, 1.0)
     breadth: _Length = setting(
-        None, "breadth of a layout's arena (null: as long as side), m, or a range", 0.2, 4.0
+        None, "breadth of a layout's arena, m, or a range; null: same as side", 0.2, 4.0
     )
     gap: _Length = setting(
         None, "free width of a door or a corridor, m, or a range", _SMALLEST_CELL, 1.0
@@ -143,7 +144,7 @@ class StageConfig(Section):
             )
 
     def _check_number(self) -> None:
-        """Refuses numbers too large for levels whose objects or starts are placed in turn."""
+        """Refuses numbers too large for levels that place objects or starts one after the other."""
         most = {"robots": _MOST_ROBOTS, "side": _LARGEST_SIDE, "obstacles": _MOST_OBSTACLES}
         for key, limit in most.items():
             if (self.sides[1] if key == "side" else getattr(self, key)) > limit:
@@ -194,7 +195,7 @@ class StageConfig(Section):
             )
 
     def _check_keys(self, layout: ArenaLayout | None) -> None:
-        """Refuses sizes that the level does not have, and asks for those that it needs."""
+        """Refuses sizes that the level does not use, and asks for those that it needs."""
         needed = () if layout is None else layout.reads
         optional = () if layout is None or layout.square else ("breadth",)
         for key in (*NUMBERS, "breadth", "cells"):
@@ -225,7 +226,7 @@ class StageConfig(Section):
 
     @property
     def kind(self) -> Kind | None:
-        """The part of the layout that is compiled in; None without a layout."""
+        """The part of the layout that is fixed in the compiled program; None without a layout."""
         if self.level not in LAYOUTS:
             return None
         cells = self.obstacles if self.level == "plots" else self.cells or 0
@@ -233,7 +234,7 @@ class StageConfig(Section):
 
     @property
     def laid_out(self) -> tuple[Kind, dict[str, Any]] | None:
-        """The layout and its numbers in units, as `drawing.stack` takes them; None without one."""
+        """The layout and its lengths, as `drawing.stack` takes them; None without a layout."""
         if self.kind is None:
             return None
         ends = [_ends(getattr(self, key) or 0.0) for key in NUMBERS]
@@ -253,7 +254,7 @@ class StageConfig(Section):
 
     @property
     def distance_units(self) -> tuple[int, int]:
-        """The smallest and the largest way from start to target, units; 0 for any."""
+        """The shortest and the longest path from start to target, units of 1/4096 m; 0 for any."""
         low, high = _ends(self.distance or 0.0)
         return round(low * UNITS), round(high * UNITS)
 
@@ -264,7 +265,7 @@ class StageConfig(Section):
 
 
 def passage(hull: float) -> float:
-    """Returns the passage between obstacles that robots of this hull radius get, m."""
+    """Returns the least width of a passage between obstacles, for this hull radius, m."""
     return max(PASSAGE, _PASSAGE_PER_HULL * hull)
 
 
@@ -276,12 +277,12 @@ def smallest_side(stage: StageConfig, hull: float = epuck.HULL_RADIUS) -> float:
     passage on either side of any single obstacle.
 
     A random level places its obstacles one after the other. The obstacles may take at most the
-    share FILLING of the free square. Discs placed this way jam at 0.547 of the area (Feder 1980),
-    which is 0.70 of a square grid of discs. Walls make them jam even earlier.
+    share FILLING of the free square. Discs placed this way find no more room once they cover 0.547
+    of the area (Feder 1980), 0.70 of what a square grid of discs covers. Walls leave less room.
 
     Args:
       stage: the stage; its `side` is not read.
-      hull: radius of the robots, m. The numbers above are those of hulls up to the e-puck's.
+      hull: radius of the robots, m. The numbers above hold for hulls up to the e-puck's.
 
     Returns:
       The side, m.

@@ -12,7 +12,7 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig
 from swarmjax.task.stage_config import StageConfig
 
-# By default, each arena gets one waiting episode for every STEPS_PER_EPISODE control steps of a
+# By default, one level is drawn for each arena and every STEPS_PER_EPISODE control steps of a
 # rollout. The shortest episodes of the six stages take 23 steps.
 STEPS_PER_EPISODE = 32
 
@@ -33,13 +33,13 @@ class ProgramConfig(Section):
         "number of runs trained at once, with seeds seed, seed + 1, ...",
         1,
         4096,
-        reason="a call of the compiled program reports 4096 rows, one per seed. Train more in "
-        "a second run, with seed=4096",
+        reason="a call of the compiled program reports at most 4096 rows, one per seed. Train "
+        "more in a second run, with seed=4096",
     )
     seeds_by: Literal["vmap", "cores", "devices"] = setting(
         "vmap",
-        "how to train the seeds; vmap: all seeds side by side; cores: in one group for each core "
-        "of a CPU; devices: in one group for each device; the seeds of a group run side by side",
+        "how to train the seeds; vmap: all side by side; cores: split over the cores of a CPU; "
+        "devices: split over the devices",
     )
     arenas: int = setting(128, "arenas simulated at once", 1, 2**20)
     devices: int = setting(
@@ -51,7 +51,7 @@ class ProgramConfig(Section):
     )
     streams: int | None = setting(
         None,
-        "number of random streams, a multiple of devices; runs with as many streams draw the same "
+        "number of random streams, a multiple of devices; runs with equally many draw the same "
         "random numbers on any number of devices; null: one for each device that shares the arenas",
         1,
         2**16,
@@ -60,7 +60,7 @@ class ProgramConfig(Section):
     levels_per_rollout: int | None = setting(
         None,
         "levels drawn for each arena before a rollout; an arena that needs more repeats the last "
-        "level, and no success counts these repeats; null: one for every 32 control steps",
+        "level, which then does not count for success; null: one for every 32 control steps",
         1,
         1024,
     )
@@ -70,7 +70,7 @@ class ProgramConfig(Section):
     )
     pieces: dict[str, dict[str, str]] = field(
         default_factory=ByName,
-        metadata=about("digest of each part of extensions in use, by kind and name", derived=True),
+        metadata=about("digest of each extension part in use, by kind and name", derived=True),
     )
 
     @property
@@ -105,5 +105,5 @@ class ProgramConfig(Section):
 
     @property
     def waiting(self) -> int:
-        """Number of episodes that are drawn for each arena before a rollout."""
+        """Number of levels that are drawn for each arena before a rollout."""
         return self.levels_per_rollout or max(1, self.algo.rollout_length // STEPS_PER_EPISODE)

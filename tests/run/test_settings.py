@@ -435,10 +435,10 @@ def test_help_lists_every_key_once():
 def test_help_gives_default_meaning_and_allowed_values():
     text = help_text(TrainConfig, "swarmjax.train", ["all"])
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "stage.robots=<the stage> active robots (a whole number 1 to 1024)" in lines
+    assert "stage.robots=<the stage> number of robots (a whole number 1 to 1024)" in lines
     assert "arenas=128 arenas simulated at once (a whole number 1 to 1048576)" in lines
     assert (
-        "run.chunk=auto updates per call of the compiled program; auto: a second of them "
+        "run.chunk=auto updates per call of the compiled program; auto: as many as take 1 s "
         "(a whole number 1 to 2147483647 or auto)" in lines
     )
     assert (

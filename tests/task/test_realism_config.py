@@ -342,7 +342,7 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     )
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
-        f"realism.mass={mass} mass, kg; per robot and episode "
+        f"realism.mass={mass} mass, kg; drawn per robot and episode "
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
