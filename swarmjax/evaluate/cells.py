@@ -83,7 +83,7 @@ def load(config: EvaluateConfig) -> Suite:
       The suite that the settings name, or one cell with their stage.
 
     Raises:
-      ConfigError: The suite is unsound, or made for smaller robots or other targets.
+      ConfigError: The suite is invalid, or made for smaller robots or other targets.
     """
     if config.suite is None:
         return Suite(None, (draw_stage(config, range(config.episodes)),))
@@ -112,7 +112,7 @@ def draw(choice: str) -> Suite:
       The suite.
 
     Raises:
-      ConfigError: The file is unsound, or a digest is wrong.
+      ConfigError: The file is invalid, or a digest is wrong.
     """
     file = read_suite(choice)
     return Suite(file.name, tuple(map(draw_cell, file.cells)))
@@ -218,7 +218,7 @@ def read(path: Path) -> Suite:
       The suite.
 
     Raises:
-      ConfigError: The file is unsound.
+      ConfigError: The file is invalid.
     """
     check_text("suite", str(path))
     try:

@@ -91,7 +91,7 @@ def act(
 def simulate(judge: Judge, levels: Sequence[level.Level]) -> Outcome:
     """Runs episodes side by side, each until all its robots have arrived or the time is out.
 
-    With `task.arrival=hold` an episode ends once all its robots are within their targets.
+    With `task.arrival=hold` an episode ends once all its robots are at their targets.
 
     Args:
       judge: Data that the arenas share.

@@ -47,8 +47,8 @@ def evaluate(
       The results.
 
     Raises:
-      PolicyError: A policy is unsound, or does not fit the levels.
-      ConfigError: A file is missing, a suite is unsound, or the physics breaks down.
+      PolicyError: A policy is invalid, or does not fit the levels.
+      ConfigError: A file is missing, a suite is invalid, or the physics breaks down.
     """
     sides = _read(settings) if entrants is None else [entrants]
     every = [each for side in sides for each in side]

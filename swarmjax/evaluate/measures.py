@@ -27,9 +27,9 @@ class Outcome(NamedTuple):
     Attributes:
       clock: [A] control steps since the start.
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
-        within its target.
+        at its target.
       arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
-        control steps until it was within its target and stayed there.
+        control steps until it was at its target and stayed there.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
       touched: [A, R, 3] control steps at whose end the robot touched something, also after arrival.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.

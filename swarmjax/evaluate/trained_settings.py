@@ -57,7 +57,7 @@ def trained(meta: Mapping[str, Any], path: str) -> Trained:
       path: Path of the file.
 
     Raises:
-      ConfigError: A number is unsound.
+      ConfigError: A number is invalid.
     """
     names = {item.name for item in fields(RobotConfig)}
     robot = {key: value for key, value in meta["robot"].items() if key in names}
@@ -96,9 +96,9 @@ def load[C: Section](
       The settings, and one line that describes what comes from the policies.
 
     Raises:
-      ConfigError: An argument is unsound or not read here, or policies were trained differently and
+      ConfigError: An argument is invalid or not read here, or policies were trained differently and
         no argument decides.
-      PolicyError: A policy is unsound.
+      PolicyError: A policy is invalid.
     """
     if "task.step_limit" in files.parse(cls, typed):
         raise ConfigError("task.step_limit works only in training: give steps=NUMBER instead.")

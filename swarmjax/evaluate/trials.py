@@ -73,7 +73,7 @@ def read_policies(files: Sequence[str], extensions: str | None = None) -> list[E
       extensions: Value of the key `extensions`.
 
     Raises:
-      PolicyError: A file is unsound.
+      PolicyError: A file is invalid.
     """
     return [Entrant(file, policy_file.read(file, extensions)) for file in files]
 

@@ -31,13 +31,13 @@ _SLACK = 1e-4  # share of a period, so that rounding does not delay a sample tha
 
 @dataclass(frozen=True, kw_only=True)
 class Electronics:
-    """Settings of the electronics, fixed for all episodes of a program.
+    """Settings of the electronics, fixed in a compiled program.
 
     Attributes:
       realism: which factors are on.
       encoding: how observations are encoded.
-      robot: the robot; its sensors are read.
-      control_step: s.
+      robot: the robot, for its sensors.
+      control_step: length of a control step, s.
       own: observations of an extension, placed after the built-in ones.
     """
 
@@ -84,7 +84,7 @@ class Sight(NamedTuple):
 
     Attributes:
       ray: [..., R, K] m, 0 to `Electronics.reach`.
-      reflectance: [..., R, K] reflectance of the surface that each ray hits; None for 1.
+      reflectance: [..., R, K] reflectance of the surface that each ray hits; None if all are 1.
       distance: [..., R] distance to the target, m.
       bearing: [..., R] bearing of the target, rad.
       own: [..., R, E] observations of an extension; None without any.
@@ -108,7 +108,7 @@ def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) 
       clock: [...] or [] control steps since the start.
 
     Returns:
-      The view of one arena or of many.
+      The view of one arena, or of many.
     """
     return View(
         pose=pose,
@@ -167,13 +167,13 @@ def reflectance(factors: Factors) -> infrared.Reflectance | None:
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode: all earlier commands are zero, and earlier observations the first one.
+    """Starts an episode. Until delayed values arrive, commands are 0 and observations the first.
 
     Args:
       electronics: electronics of the program.
       factors: factors of the episode.
       sight: exact sensor quantities at the start.
-      clock: [...] or [] zero.
+      clock: [...] or [] control steps since the start, which are 0.
       xp: `numpy` or `jax.numpy`.
 
     Returns:
@@ -191,7 +191,7 @@ def begin(
 
 
 def _fill(latency: tuple[int, int] | None, first: Array, xp: Any) -> Array | None:
-    """Fills the queue of the largest latency with the first value; None without latency."""
+    """Makes a queue for the largest latency, filled with `first`; None without latency."""
     depth = latency[1] if latency else 0
     return xp.stack([first] * depth, axis=-3) if depth else None
 
@@ -199,7 +199,7 @@ def _fill(latency: tuple[int, int] | None, first: Array, xp: Any) -> Array | Non
 def _delay(
     queue: Array | None, newest: Array, latency: Array | None, xp: Any
 ) -> tuple[Array | None, Array]:
-    """Puts the newest values [..., R, n] into the queue; returns it, and the values due now."""
+    """Puts the newest values [..., R, n] into the queue; returns the queue and the values due."""
     if queue is None or latency is None:
         return queue, newest
     values = xp.concatenate([newest[..., None, :, :], queue], axis=-3)
@@ -325,7 +325,7 @@ def _read_counts(
 def _find_target(
     realism: RealismConfig, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Array, Array]:
-    """Returns distance and bearing [..., R] of the targets, as an overhead camera sees them."""
+    """Returns distance and bearing [..., R] of the targets, with noise as of a camera."""
     distance, bearing = sight.distance, sight.bearing
     robots = distance.shape[-1:]
     if realism.target_distance_noise is not None:

@@ -39,7 +39,7 @@ class EnvState:
 
     Attributes:
       sim: a `PhysicsState` before and after a rollout; during a rollout, the engine's own data.
-      level: the level that the episode started from, with the targets of now.
+      level: the level that the episode started from, with the current targets.
       factors: realism factors of the episode, drawn from the level's seed.
       memory: state of the robots' electronics.
       observation: [R, O] input of the policy.
@@ -49,7 +49,7 @@ class EnvState:
         its target now.
       distance: [R] distance to the target, m.
       apart: [R, 3] time since the last contact of each kind ended, s.
-      episode: sums since the start.
+      episode: sums since the start of the episode.
       path: the shortest paths to the targets; None if the reward does not use them.
     """
 
@@ -74,8 +74,8 @@ class TimeStep(NamedTuple):
       observation: [R, O].
       reward: [R].
       terminated: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
-        are within their targets.
-      truncated: [R] whether the robot ran out of time.
+        are at their targets.
+      truncated: [R] whether the time ran out or the physics broke before that.
       valid: [R] whether to learn from the transition: the robot drove (with `latch`, it had not
         arrived before) and the physics is sound.
       done: [] whether the arena's episode is over.
@@ -164,8 +164,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
       world: the compiled environment.
       state: the arena, with `sim` as the physics' own data. Fields of a subclass of `EnvState`
         pass through unchanged.
-      action: [R, U] command, clipped to -1..1; -1 and 1 are the ends of its range. Broadcast
-        numbers start at the third entry.
+      action: [R, U] command, clipped to -1..1; -1 and 1 are the ends of its range.
 
     Returns:
       The new state, and the outcome of the step.
@@ -174,7 +173,9 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     active = state.level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    looked, around = _look(world, pose, state.level, state.factors)  # at the targets of before
+    looked, around = _look(
+        world, pose, state.level, state.factors
+    )  # with the targets from before the step
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)
@@ -202,7 +203,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     sound &= _is_finite(sight.distance, level.present) & _is_finite(seen, level.present[:, None])
     valid = active & sound
     gained = jnp.where(valid, gained, 0.0)
-    # Learning skips the step of a broken arena, so the critic need not see it either.
+    # Learning skips the step of a broken arena, so its observation keeps the last sound values.
     seen = jnp.where(sound, seen, state.observation)
     counted = valid & world.goal.is_under_way(state.arrived)
     episode = _tally(state.episode, gained, begins, earned, counted)
@@ -222,7 +223,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
 def _turn(
     world: World, state: EnvState, sight: Sight, pose: Array, clock: Array
 ) -> tuple[Turn, Level, Sight]:
-    """Asks the goal; returns its answer, the level with the new targets, and the sight of them."""
+    """Advances the goal; returns its turn, the level with new targets, and the sight of these."""
     view = task_electronics.view(sight, pose, state.level, state.arrived, clock)
     turn = world.goal.turn(state.goal, state.level, view)
     if not world.goal.moves:
@@ -242,7 +243,7 @@ def _reward_step(
     pose: Array,
     action: Array,
 ) -> reward.Step:
-    """Assembles the input of the reward terms; `sight` is still of the targets of before."""
+    """Assembles the input of the reward terms; `sight` has the targets from before the step."""
     step = reward.Step(
         distance_before=before.distance,
         distance=sight.distance,
@@ -294,7 +295,7 @@ def _move(
 
 
 def _look(world: World, pose: Array, level: Level, factors: Factors) -> tuple[Sight, Surround]:
-    """Looks around from poses [R, 3]."""
+    """Computes what the sensors measure at poses [R, 3]."""
     distance, bearing = observation.to_target(pose, level.target, jnp)
     shades = task_electronics.reflectance(factors)
     scene = senses.Scene(pose, level.side, level.obstacle, factors.infrared_yaw, shades)
@@ -318,7 +319,7 @@ def _look_by_extension(
 def _tally(
     episode: Episode, gained: Array, begins: Array, earned: reward.Step, counted: Array
 ) -> Episode:
-    """Adds a step to the episode's sums, for the `counted` robots [R] only."""
+    """Adds a step to the sums; for `sensed` and `moving`, only `counted` robots [R] count."""
     sensed = counted & (reward.proximity(earned) > 0.0)
     return Episode(
         reward=episode.reward + gained,

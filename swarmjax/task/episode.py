@@ -44,18 +44,18 @@ class Robots(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Finished episodes, [T, A, ...]; zero where no episode ended.
+    """Finished episodes by control step and arena, [T, A, ...]; zero where no episode ended.
 
     Attributes:
       episodes: 1 where an episode ended.
       stage: stage on which the episode began.
       cohort: cohort in which the episode began; -1 where no episode ended.
-      targets: robots present.
-      reached: robots that had arrived at the end.
+      targets: number of robots present; each has one target.
+      reached: number of robots that had arrived at the end.
       all_reached: 1 where every robot had arrived.
-      steps: control steps.
+      steps: control steps of the episode.
       robot_steps: control steps before arrival, summed over robots.
-      sensed: control steps in which a ray was shorter than the infrared range.
+      sensed: control steps in which a ray was shorter than the infrared range, summed over robots.
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
       broken: 1 where the episode ended because the arena was no longer `sound`.

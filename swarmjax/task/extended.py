@@ -45,7 +45,7 @@ def draw(uniforms: Any, stage: Stage, spacing: Spacing, drawings: Sequence[Level
       uniforms: uniform numbers, as `level.sample` takes them.
       stage: fields [].
       spacing: sizes.
-      drawings: extension drawings, in the order that `stage.drawing` counts.
+      drawings: extension drawings; `stage.drawing` counts them from 1.
 
     Returns:
       The level; absent robots and obstacles are parked outside.
@@ -100,7 +100,7 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
       obstacles: M.
 
     Raises:
-      ConfigError: a piece returns something else; the message says what it should return.
+      ConfigError: a piece does so; the message says what it should return.
     """
     drawn = level_shapes(robots, obstacles)
     seen = view_shapes(drawn, robot)

@@ -15,7 +15,7 @@ from swarmjax.sim.realism_config import RealismConfig
 
 Array = Any
 
-# Settings that draw random numbers at every control step. These settings need the seed as well.
+# Settings that draw random numbers at every control step, and therefore need the seed.
 _PER_STEP = ("speed_noise", "target_distance_noise", "target_bearing_noise")
 
 
@@ -31,13 +31,13 @@ class Factors(NamedTuple):
       friction: [..., R] friction between wheels and floor.
       infrared_noise: [..., R, K] factor on the noise of the response.
       infrared_gain: [..., R, K] factor on the reflected part of the response.
-      infrared_yaw: [..., R, K] rad.
-      infrared_period: [..., R] s between samples.
+      infrared_yaw: [..., R, K] yaw error, rad.
+      infrared_period: [..., R] time between samples, s.
       dead_sensor: [..., R, K] whether the sensor never detects anything.
-      reflectance: [..., 1 + M] of all walls, and of each obstacle.
-      reflectance_robot: [..., R].
-      action_latency: [..., R] control steps, int32.
-      observation_latency: [..., R] control steps, int32.
+      reflectance: [..., 1 + M] reflectance of all walls, then of each obstacle.
+      reflectance_robot: [..., R] reflectance of each robot.
+      action_latency: [..., R] latency of commands, control steps, int32.
+      observation_latency: [..., R] latency of observations, control steps, int32.
     """
 
     seed: Array | None = None
@@ -151,14 +151,14 @@ def draw(
 
 
 def largest(robot: RobotConfig, realism: RealismConfig) -> RobotConfig:
-    """Returns the robot to compile the model for, with the largest values of any episode.
+    """Returns the robot to compile the model for, with the largest wheels of any episode.
 
     Args:
       robot: the nominal robot.
       realism: which factors are drawn.
 
     Returns:
-      The robot, with a wheel radius that no draw exceeds; its speeds are not for driving.
+      The robot, with a wheel radius that no draw exceeds. Ignore its speeds.
     """
     most = realism.wheel_radius[1] if realism.wheel_radius else robot.wheel_radius
     return replace(robot, wheel_radius=most, wheel_limit="clip")

@@ -25,7 +25,7 @@ BOX_HALF = 0.05  # m; the 0.1 m boxes of the stock e-puck world
 SPACING = 0.1  # m; between starts, and between targets: wider than a robot
 # Centres of the boxes in the example's arena, in order of use. The boxes lie between starts and
 # targets. In arenas of 1 m and more, at least 0.10 m is free between two boxes. This project chose
-# them.
+# the positions.
 BOXES = ((0.0, 0.02), (-0.17, -0.12), (0.17, 0.1), (0.02, -0.2))
 
 

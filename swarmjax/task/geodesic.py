@@ -7,9 +7,9 @@ The smallest of these sums is the robot's distance. Navigation rewards count pro
 path (Wijmans et al. 2020, "DD-PPO", section 4).
 
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
-corners, so a robot that touches an obstacle is still outside. Path lengths are therefore between a
-millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as passable, but no
-robot fits through. Neither error matters to the reward, which needs the right way around the
+corners, so a robot that touches an obstacle is outside the widened one. Path lengths are therefore
+between a millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as
+passable, but no robot fits through. Neither error matters to the reward, which needs the right way around the
 obstacles, and a length that shrinks along that way.
 """
 
@@ -28,7 +28,7 @@ from swarmjax.task.surroundings import into_frame
 # radius.
 _WIDENED = 0.8
 _CORNER = 0.9
-# m; lengths of a path that differ by less are equal. They are float32 sums below 10 m.
+# m; path lengths that differ by less count as equal. They are float32 sums below 10 m.
 _SAME = 1e-4
 _SIGNS = ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))
 

@@ -1,4 +1,4 @@
-"""Levels: the starting conditions of an episode, drawn at a fixed cost from uniform numbers.
+"""Levels: the starting conditions of episodes, each drawn from a fixed count of uniform numbers.
 
 The code takes the array module as an argument. NumPy and JAX draw the same level from the same
 numbers.
@@ -64,7 +64,7 @@ class Level(NamedTuple):
 
 
 class Spacing(NamedTuple):
-    """Sizes that a level is drawn with, fixed for a program.
+    """Sizes that levels are drawn with, fixed in a compiled program.
 
     Attributes:
       robots: largest number of robots, R.
@@ -94,7 +94,7 @@ class _Uniforms(NamedTuple):
 
 
 def uniform_count(spacing: Spacing) -> int:
-    """Returns how many uniform numbers a level takes."""
+    """Returns how many uniform numbers a level is drawn from."""
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
@@ -190,7 +190,7 @@ def _seed(drawn: _Uniforms, xp: Any) -> Array:
 def _side(stage: Stage, seed: Array, xp: Any) -> Array:
     """Draws the side of the arena, m, in whole units, if the stage gives a range.
 
-    The side is a hash of the level's seed, so nothing else in the level depends on it.
+    The side is drawn from a hash of the level's seed, so it changes no other random number.
     """
     low = xp.ceil(stage.side * UNITS).astype(xp.int32)
     count = xp.floor(stage.largest_side * UNITS).astype(xp.int32) - low + 1
@@ -298,7 +298,7 @@ def _laid_out(
 
 
 def _at_distance(level: Level, distance: Array, spacing: Spacing, xp: Any) -> Level:
-    """Moves the starts to places with a given way to their targets, if the stage gives one.
+    """Moves starts so that paths to the targets have the stage's `distance`, if it gives one.
 
     A level without room for all robots keeps its own starts.
     """

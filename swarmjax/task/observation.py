@@ -191,12 +191,12 @@ class View(NamedTuple):
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).
       target: [R, 2] x (m), y (m).
-      distance: [R] distance to the own target, m.
-      bearing: [R] bearing of the own target, rad.
+      distance: [R] distance to the robot's own target, m.
+      bearing: [R] bearing of the robot's own target, rad.
       infrared: [R, K] length of each ray, m.
       present: [R] whether the robot is present, bool.
       arrived: [R] whether the robot has arrived, bool; with `task.arrival=hold`, whether it is
-        within its target now.
+        at its target now.
       side: [] side of the arena, m.
       obstacle: [M, 5] x (m), y (m), yaw (rad), half edges (m).
       obstacle_present: [M] bool.

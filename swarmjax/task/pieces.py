@@ -33,7 +33,7 @@ def choose(extensions: Extensions, task: TaskConfig, stages: Sequence[StageConfi
       extensions: the available pieces.
       task: the task, which names observations and weights. By default, all observations are used,
         and each term has its own default weight.
-      stages: name level drawings.
+      stages: stages, which may name level drawings.
 
     Returns:
       The pieces.

@@ -151,7 +151,7 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
 
 
 def score_open(points: Array, is_open: Array, xp: Any) -> Array:
-    """Scores points by whether they may be used.
+    """Scores points by whether they are open for placement.
 
     Args:
       points: [P, 2] units.
@@ -159,7 +159,7 @@ def score_open(points: Array, is_open: Array, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where a point is open, very low where it is not.
+      [P] 0 where a point is open, else very low.
     """
     return xp.where(is_open, 0, FORBIDDEN + 0 * points[:, 0])
 
@@ -232,8 +232,8 @@ def fold(
 
 
 def repeat[S](count: int, step: Callable[[Array, S], S], state: S, xp: Any) -> S:
-    """Calls `step(i, state)` for each i below `count`; XLA takes long to compile it unrolled."""
-    if xp is not np and count:  # JAX traces the step even if it is called for nothing
+    """Calls `step(i, state)` for each i below `count`; XLA compiles unrolled steps slowly."""
+    if xp is not np and count:  # JAX traces the step even if `count` is 0
         from jax import lax  # evaluations draw levels without JAX
 
         return lax.fori_loop(0, count, step, state)

@@ -21,11 +21,11 @@ class Step(NamedTuple):
 
     Attributes:
       distance_before: [R] distance to the target, m.
-      distance: [R] distance after the step to the same target, m; it may move only then.
+      distance: [R] distance after the step, m, to the target from before the step.
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
-        robots are within their targets, which ends the episode.
+        robots are at their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
       touching: [R, 3] whether the robot touches something of each kind after the step.
       outside: [R] whether the robot had not yet arrived when the step began.
@@ -101,7 +101,7 @@ def step_penalty(step: Step) -> Array:
 
 
 def _number(step: Step, values: Array) -> Array:
-    """Returns values as numbers of the kind of the distances."""
+    """Converts values to the number type of the distances."""
     return values.astype(step.distance.dtype)
 
 

@@ -41,7 +41,7 @@ def check(
             for drawn in _levels(stage, spacing, drawings):
                 _check_own(own, stage, drawn, spacing)
         elif must_check(stage, spacing.hull_radius):
-            # A level in which no starts have the way and room keeps those that are checked here.
+            # If no starts at this distance have room, a level keeps those that are checked here.
             for drawn in _levels(replace(stage, distance=None), spacing):
                 check_level(stage, drawn, spacing)
         if stage.distance is not None:
@@ -86,7 +86,7 @@ def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
     arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
     problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
     if not problem and (arrived & drawn.present).any():
-        problem = "a robot starts within its target"
+        problem = "a robot starts at its target"
     if problem:
         raise ConfigError(
             f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots, "
@@ -104,7 +104,7 @@ def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spa
 
 
 def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[LevelDrawing]) -> None:
-    """Refuses a distance at which a robot has arrived, or that no level has."""
+    """Refuses a distance at which a robot has already arrived, or that no level can have."""
     least = round(spacing.target_radius + MARGIN, 4)
     ends = np.array(stage.distance_units)
     if ends[0] < round_up(least):
@@ -113,7 +113,7 @@ def _check_distance(stage: StageConfig, spacing: Spacing, drawings: Sequence[Lev
             f"{spacing.target_radius:g} m of its target: give at least {least:g}."
         )
     sizes = spacing.hull_radius, spacing.target_radius
-    # Absent robots would take as long as the others.
+    # Absent robots, left out here, would take as long as the others.
     own = spacing._replace(robots=stage.robots, obstacles=stage.obstacles)
     levels = _levels(replace(stage, distance=None), own, drawings)
     if not any(ways.starts(each, ends, *sizes, np)[1].any() for each in levels):

@@ -32,7 +32,7 @@ class Stage(NamedTuple):
       drawing: 1 + index of the extension drawing of the stage's levels, 0 for none, int32.
       map: the maps; None if no stage has one.
       layouts: numbers of the stages' layouts, by kind; None if no stage has one.
-      distance: smallest and largest way from start to target, [2] units, int32; 0 for any; None
+      distance: shortest and longest path from start to target, [2] units, int32; 0 for any; None
         if no stage has one.
       laid_out: true if all stages have a layout; None if any stage has none.
     """

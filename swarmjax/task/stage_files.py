@@ -1,4 +1,4 @@
-"""Finds the stages that a choice of configs/stage/ names: one stage or a sequence."""
+"""Finds the stages that `stage=NAME` chooses in configs/stage/: one stage or a sequence."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -63,15 +63,15 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
 def load_levels[C: Section](
     cls: type[C], overrides: Sequence[str], stage: dict[str, Any] | None = None
 ) -> C:
-    """Creates the settings of a command that plays the levels of one stage or of a suite.
+    """Creates the settings of a command that runs levels of one stage or of a suite.
 
     Args:
       cls: the command's dataclass, with `stage` and `suite`.
-      overrides: `key=value` words.
+      overrides: `key=value` arguments.
       stage: plain data of the default stage; None for the stage of the command's file.
 
     Raises:
-      ConfigError: a word is invalid, or a suite is given together with a key that the suite sets
+      ConfigError: an argument is invalid, or a suite is given together with a key that it sets
         itself.
     """
 
@@ -131,7 +131,7 @@ def _named(stage: dict[str, Any], choice: str) -> dict[str, Any]:
 
 
 def _check_name(stage: dict[str, Any], choice: str) -> None:
-    """Refuses a name that is not the file's."""
+    """Refuses a name that differs from the file's."""
     name = name_of(choice)
     given = stage.get("name", name)
     if given != name:

@@ -18,12 +18,12 @@ from swarmjax.task.nearest import nearest
 
 NEAREST_ROBOTS = 8
 NEAREST_RECTANGLES = 12  # boxes, and walls inside and around the arena
-# m; anything farther away is shown at this distance, in its direction. The stage files have arenas
-# up to this wide. The numbers are not normalised: most rows are 0, so a running deviation would be
-# small and would magnify the first entries.
+# m; anything farther away is shown at this distance, in its direction. No arena of the stage
+# files is wider. The numbers are not normalised: most rows are 0, so a running deviation would be
+# small and would magnify the first other entries.
 REACH = 2.0
 FARTHEST = 4.0  # m; the largest distance to go that is shown, because paths wind around walls
-_NEAR = 1e-3  # m; below it, the direction to a waypoint fades
+_NEAR = 1e-3  # m; nearer than this, the direction to a waypoint shrinks to 0
 
 _OWN = 6  # target x, y; arrived; distance to go; direction to the waypoint x, y
 _ROBOT = 8  # presence; x, y, heading x, y, target x, y, arrived

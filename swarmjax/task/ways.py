@@ -1,12 +1,12 @@
-"""Places starts at a given way from their targets, along the shortest path round walls.
+"""Places starts so that their ways, the shortest paths to the targets, have a given length.
 
-Many points all over the arena have a shortest way to the target, through corners of a visibility
-graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
+From many points all over the arena, the ways are found through corners of a visibility graph
+(Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths Among Polyhedral
 Obstacles"). A point with a longer way than wanted moves along its first straight leg, until the
 rest is as long as wanted. All lengths are integers, so NumPy and JAX choose the same starts.
 
-Walls are widened as in `geodesic.py`. Ways turn at the corners of walls only. Among turned boxes,
-a start therefore sees its target past the squares around the boxes, and its way is straight.
+Walls are widened as in `geodesic.py`. Ways turn at the corners of walls only. Turned boxes count as
+the squares around them, and ways past these are straight.
 
 Axes: R robots, M obstacles, K = 4 M corners, P points. Lengths are units of 1/4096 m.
 """
@@ -41,10 +41,10 @@ Array = Any
 _WIDENED, _CORNER = 0.8, 0.9
 _NO_WAY = 2**29  # length of a way that does not exist; an int32 holds the sum of two
 _SQUARE = np.float32(1.41422)  # half edge of the square around a turned square of half edge 1
-_OTHER = 2**27  # subtracted from the score of a start with another way; soft scores are less
+_OTHER = 2**27  # subtracted from the score if the way has another length; soft scores are less
 _POINTS = 576
-_LARGE = 2**15  # legs of a table that is made in blocks
-_TIGHT = 4e-3  # m; least free space beside walls, where there is not room for more
+_LARGE = 2**15  # a table of this many legs or more is made in blocks
+_TIGHT = 4e-3  # m; least free space beside walls, where there is no room for more
 # Multiples of these shares of 2**32 fill a square evenly, and no two points have the same x or y,
 # so that some lie in every narrow corridor (Roberts 2018, "The Unreasonable Effectiveness of
 # Quasirandom Sequences": 1 / g and 1 / g**2 with g**3 = g + 1).
@@ -78,11 +78,11 @@ def starts(
     """Chooses starts from which the ways to the targets have a given length.
 
     Starts keep the distances of `gaps_of` from each other and from the targets of other robots. A
-    robot that finds no such start gets one with another way, or one without room if there is none.
+    robot that finds no such start gets one whose way has another length, or else one without room.
 
     Args:
       level: the level as drawn, a `level.Level`.
-      distance: [2] smallest and largest way, units. A level draws one way for all of its robots.
+      distance: [2] shortest and longest way, units. A level draws one length for all its robots.
       hull: radius of the robots, m.
       reach: radius of the arrival zone, m.
       xp: `numpy` or `jax.numpy`; both choose the same starts.
@@ -141,8 +141,8 @@ def _candidates(
     """Lists possible starts of a robot: points moved along their ways, and the points themselves.
 
     Returns:
-      The starts [2 P, 2], whether they have the way, and whether they have any way of at least
-      `least`.
+      The starts [2 P, 2]; whether their ways have the wanted length; and whether they may be used:
+      moved points of this length, and points with a way of at least `least`.
     """
     place = xp.concatenate([plan.target[robot][None], plan.corner])
     legs = xp.concatenate([plan.to_target[:, robot][:, None], plan.to_corner], axis=1)

@@ -346,7 +346,7 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
-        f"realism.action_latency={mass} latency of commands, control steps; per robot and episode "
-        "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
+        f"realism.action_latency={mass} latency of commands, control steps; drawn per robot and "
+        "episode (a range [low,high] of whole numbers 0 to 1000 or null)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)

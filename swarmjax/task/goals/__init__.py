@@ -1,7 +1,7 @@
-"""What robots are asked to do: `task.goal` names one.
+"""Goals, which define what robots are asked to do; `task.goal` names one.
 
-- goal.py: what every goal defines, and when episodes end; start here.
+- goal.py: what every goal defines, and when episodes end. Start reading here.
 - navigate.py, lifelong.py, gather.py, cover.py: the built-in goals.
 
-A goal of one's own is an extension; see `swarmjax.extension.goal`.
+To add your own goal, write an extension; see `swarmjax.extension.goal`.
 """

@@ -2,7 +2,7 @@
 
 The floor is a grid of cells; those on which no robot can stand do not count. A cell is seen once
 its centre has been within infrared range of a hull. All robots share the map of what has been seen,
-and each is shown the nearest cell that is left (Yamauchi 1998, "Frontier-Based Exploration Using
+and each robot's target is the nearest unseen cell (Yamauchi 1998, "Frontier-Based Exploration Using
 Multiple Robots").
 """
 
@@ -38,7 +38,7 @@ class Cover(Goal):
     measures: Mapping[str, Measure] = {"floor_seen": Measure("floor seen", "%", is_good=True)}
 
     def begin(self, level: Level) -> tuple[Floor, Array]:
-        """Draws the map; see `Goal.begin`."""
+        """Makes the map; see `Goal.begin`."""
         cell = _cells(level.side)
         free = _clearance(cell, level) >= self.sizes.hull_radius
         floor = Floor(free, free.sum(axis=-1))
@@ -83,7 +83,7 @@ def _clearance(cell: Array, level: Level) -> Array:
 
 
 def _nearest(left: Array, cell: Array, place: Array, level: Level) -> Array:
-    """Returns the nearest cell [..., R, 2] that is left; the own place if none is."""
+    """Returns each robot's nearest unseen cell [..., R, 2], m; its own place if none is left."""
     xp = place.__array_namespace__()
     step = place[..., :, None, :] - cell[..., None, :, :]
     far = xp.where(left[..., None, :], (step**2).sum(axis=-1), xp.inf)

@@ -1,8 +1,8 @@
 """`gather`: all robots come together, anywhere.
 
 Each robot senses distance and bearing of the middle of all other robots, as a range-and-bearing
-board or a camera gives them; no place is agreed on. Robots have gathered when all centres lie in a
-disc around their middle. The disc is four times as large as all hulls together.
+board or a camera gives them. No meeting place is set. Robots have gathered when all centres lie in
+a disc around their middle. The disc has four times the area of all hulls together.
 """
 
 from collections.abc import Mapping

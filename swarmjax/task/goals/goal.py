@@ -1,9 +1,8 @@
-"""The seam between environment and goal: where targets are, who has arrived, what is measured.
+"""The interface of goals: where targets are, which robots have arrived, what is measured.
 
 Training and the judge in MuJoCo C call a goal in the same way, with JAX arrays of one arena or with
 NumPy arrays of many. A goal takes the array module from its arguments and indexes axes from the
-end, so one text serves both. A goal of an extension need not: it always gets JAX arrays of one
-arena.
+end, so the same code serves both. A goal of an extension always gets JAX arrays of one arena.
 """
 
 from collections.abc import Mapping
@@ -18,12 +17,12 @@ End = Literal["each", "all", "never"]
 ENDS = get_args(End)
 State = Any  # an array, or a tuple of them
 
-# How the metrics of training name a goal's own measures: with this before the name.
+# Prefix of the names of a goal's own measures among the metrics of training.
 MEASURED = "measured_"
 
 
 class Measure(NamedTuple):
-    """A figure with one number per level.
+    """A metric with one number per level.
 
     Attributes:
       label: Name of the measure in a table.
@@ -38,7 +37,7 @@ class Measure(NamedTuple):
 
 
 class GoalSizes(NamedTuple):
-    """Numbers of the settings that goals may use.
+    """Settings that goals may use.
 
     Attributes:
       control_step: s.
@@ -56,13 +55,13 @@ class GoalSizes(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """What a goal says after a control step.
+    """The results of a goal after a control step.
 
     Attributes:
       state: the goal's state for the next step.
       target: [..., R, 2] where each robot's target is from now on, m.
-      arrived: [..., R] whether the robot has arrived, bool. Success is the share of these robots.
-      earns: [..., R] whether the robot earns the reward `arrival`, bool; None: as episodes end.
+      arrived: [..., R] whether the robot has arrived, bool. Their share is the success.
+      earns: [..., R] whether the robot earns the reward `arrival`, bool; None: as `terminates`.
       measured: value so far of each of the goal's `measures`, [...] by name.
     """
 
@@ -74,15 +73,15 @@ class Turn(NamedTuple):
 
 
 class Goal:
-    """A goal. This one never changes the targets, and is reached once all robots are at theirs.
+    """The base of goals. Targets stay, and the goal is reached once all robots are at theirs.
 
     Attributes:
-      ends: what ends before the time is out. `each`: a robot that arrives stops for good, and
-        the episode is over when all have. `all`: the episode is over when all robots have arrived
-        in the same control step. `never`: nothing ends.
+      ends: what ends an episode before the time is out. `each`: a robot that arrives stops for
+        good, and the episode is over when all have. `all`: the episode is over when all robots have
+        arrived in the same control step. `never`: nothing.
       moves: whether targets may change within an episode.
-      measures: figures of its own, by name.
-      sizes: numbers of the settings.
+      measures: the goal's own measures, by name.
+      sizes: settings of the task and the robot.
     """
 
     ends: End = "all"
@@ -97,25 +96,25 @@ class Goal:
         return (), level.target
 
     def advance(self, state: State, level: Level, view: View) -> Turn:
-        """Says where the robots stand after a control step.
+        """Computes targets, arrivals and measures after a control step.
 
         Args:
-          state: from `begin` or from the turn before.
+          state: from `begin` or from the previous turn.
           level: the level, with the targets of this step.
-          view: the arena after the step; `view.arrived` is that before the step.
+          view: the arena after the step, but with `arrived` from before it.
         """
         del level
         return Turn(state, view.target, view.present & self.is_near(view))
 
     def turn(self, state: State, level: Level, view: View) -> Turn:
-        """Advances; with `ends="each"`, a robot that has arrived stays arrived."""
+        """Calls `advance`; with `ends="each"`, a robot that has arrived stays arrived."""
         found = self.advance(state, level, view)
         if self.ends != "each":
             return found
         return found._replace(arrived=view.arrived | found.arrived)
 
     def is_near(self, view: View) -> Array:
-        """Returns whether each robot [..., R] is within its target."""
+        """Returns whether each robot [..., R] is at its target."""
         return view.distance <= self.sizes.target_radius
 
     def drives(self, arrived: Array) -> Array:

@@ -17,13 +17,14 @@ Array = Any
 
 
 class Errands(NamedTuple):
-    """The places of a level, and what has been done.
+    """The places that robots are sent to, and how many targets they have reached.
 
     Attributes:
       start: [..., R, 2] the starts of the level, m. Robots are sent to the starts and targets of
         the level, since all of them can be reached.
       target: [..., R, 2] the targets of the level, m.
-      taken: [..., R] number of each robot's target: 2 i is robot i's target, 2 i + 1 its start.
+      taken: [..., R] index of each robot's target; 2 i is the target of robot i in the level, and
+        2 i + 1 its start.
       count: [..., R] targets reached.
     """
 
@@ -58,9 +59,9 @@ class Lifelong(Goal):
         number = xp.arange(2 * robots)
         is_taken = (state.taken[..., None] == number).any(axis=-2)
         there = xp.repeat(view.present, 2, axis=-1)
-        # The numbers of a robot's two places do not depend on how many robots there are.
+        # The random numbers of a robot's two places do not depend on how many robots there are.
         drawn = noise.uniform(level.seed, view.clock, Stream.NEXT_TARGET, (2 * robots,), xp)
-        # Free places come first, in random order. The k-th robot that arrives takes the k-th.
+        # Free places come first, in random order. The k-th robot that arrives takes the k-th place.
         order = xp.argsort(xp.where(there & ~is_taken, drawn, 2.0), axis=-1, stable=True)
         rank = xp.maximum(xp.cumsum(reached, axis=-1) - 1, 0)
         taken = xp.where(reached, xp.take_along_axis(order, rank, axis=-1), state.taken)

@@ -2,9 +2,9 @@
 
 `task.arrival` says when a robot has arrived:
 
-- `latch`: a robot that comes within its target has arrived and stops for good.
-- `hold`: a robot counts as arrived while it is within its target, but it keeps driving and may
-  leave. An episode is over once all robots are within their targets in the same control step.
+- `latch`: a robot that reaches its target has arrived and stops for good.
+- `hold`: a robot counts as arrived while it is at its target, but it keeps driving and may leave.
+  An episode is over once all robots are at their targets in the same control step.
   Multi-agent path finding calls this condition "stay at target" (Stern et al. 2019, "Multi-Agent
   Pathfinding: Definitions, Variants, and Benchmarks").
 """
@@ -50,7 +50,7 @@ class Moving(Navigate):
         xp = level.target.__array_namespace__()
         turn = super().advance(state, level, view)
         moved = level.target + state * self.sizes.control_step
-        # Where a robot cannot get, a target does not go either.
+        # A target stays where a robot can reach it.
         most = (level.side / 2.0 - self.sizes.hull_radius)[..., None, None]
         velocity = xp.where(xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state), state)
         target = xp.where(view.present[..., None], xp.clip(moved, -most, most), level.target)

@@ -1,4 +1,4 @@
-"""Goals of an extension: their checks, and how the judge runs them."""
+"""Checks goals of an extension, and adapts them to the judge."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,15 +16,15 @@ from swarmjax.task.goals.goal import ENDS, Goal, Measure, Turn
 from swarmjax.task.level import Level
 from swarmjax.task.observation import View
 
-# What a goal leaves as it is: judge and training would not agree otherwise.
+# Methods that a goal must not override, because judge and training would then disagree.
 _FIXED = ("turn", "drives", "is_under_way", "is_over", "terminates", "measured")
 
 
 class SideBySide(Goal):
-    """A goal of an extension, for the judge: NumPy arrays of many arenas in and out."""
+    """A goal of an extension for the judge: takes and returns NumPy arrays of many arenas."""
 
     def __init__(self, own: Goal) -> None:
-        """Takes the goal."""
+        """Wraps a goal."""
         super().__init__(own.sizes)
         self.ends, self.moves, self.measures = own.ends, own.moves, own.measures
         self._begin = jax.jit(jax.vmap(own.begin))
@@ -50,7 +50,7 @@ def check(piece: OwnGoal, goal: Goal, robot: RobotConfig, robots: int, obstacles
       obstacles: M.
 
     Raises:
-      ConfigError: something is wrong; the message says what is right.
+      ConfigError: the goal is invalid; the message says what to change.
     """
     name = extended.label(piece)
     _check_class(name, goal)

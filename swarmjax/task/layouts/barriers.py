@@ -1,9 +1,10 @@
 """Walls that stand between starts and targets: a trap, a fence, a door, and two corridors.
 
 A trap is a U-shaped wall that opens towards the robots, with the targets behind it. A fence starts
-at one side of the arena and leaves a way around its end. A door joins two halls for one robot at a
-time, with robots going both ways. Corridors are for one robot at a time. One has a bay, where one
-robot lets the other pass. The other is a dead end, with targets one behind the other.
+at one side of the arena and leaves a way around its end. A door joins two halls; one
+robot at a time passes it, in either direction. Corridors are for one robot at a time. One has a
+bay, where one robot lets the other pass. The other is a dead end, with targets one behind the
+other.
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
 """Grids of cells, some of which are blocked at random, as in benchmarks of path finding on grids.
 
-Robots start in free cells that are connected, and so do their targets (Skrynnik et al. 2025,
-"POGEMA: A Benchmark Platform for Cooperative Multi-Agent Pathfinding", random maps). Whether all
-robots can arrive depends on how they have to give way to each other, which is not checked.
+Starts and targets lie in free cells that are connected (Skrynnik et al. 2025,
+"POGEMA: A Benchmark Platform for Cooperative Multi-Agent Pathfinding", random maps). Robots
+may block each other: whether all of them can arrive is not checked.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from swarmjax.task.layouts.site import ArenaLayout, Drawn, Site, pick
 from swarmjax.task.placement import repeat, split
 
 Array = Any
-_MOST = 0.4  # largest share of blocked cells; half of the cells at random seldom connect
+_MOST = 0.4  # largest share of blocked cells; with half of them blocked, few others connect
 
 
 def draw(uniforms: Array, site: Site, xp: Any) -> Drawn:

@@ -34,7 +34,7 @@ class LayoutArrays(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """The part of a layout that is compiled in.
+    """The part of a layout that is fixed in the compiled program.
 
     Attributes:
       name: name in `LAYOUTS`.
@@ -88,10 +88,10 @@ def draw(
     reach: float,
     xp: Any,
 ) -> tuple[Array, Drawn]:
-    """Lays an arena out.
+    """Draws an arena with this layout.
 
     Args:
-      kind: the compiled part.
+      kind: the part that is fixed in the program.
       of: numbers of the layout in one stage, in fields [...].
       uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
       present: [R] whether the robot is present.

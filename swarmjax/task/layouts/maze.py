@@ -27,7 +27,7 @@ def edges(cells: int) -> np.ndarray:
       cells: number of cells along a side.
 
     Returns:
-      [E, 2] indices of cells, which count row by row from below. Pairs along x come first.
+      [E, 2] indices of cells, which are numbered row by row from below. Pairs along x come first.
     """
     number = np.arange(cells * cells).reshape(cells, cells)
     along = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)
