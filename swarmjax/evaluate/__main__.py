@@ -1,10 +1,10 @@
-"""`python -m swarmjax.evaluate policy=FILE suite=stages`: judges policies on levels never seen.
+"""`python -m swarmjax.evaluate policy=FILE suite=stages`: evaluates policies on new levels.
 
 `cells.py` draws the levels, `trials.py` runs the episodes, and `summary.py` summarises them. This
 module joins them, and writes and shows the result.
 
 Examples:
-  # 1,000 levels of its last stage, on wheels
+  # 1,000 levels of the policy's last stage, on wheels
   python -m swarmjax.evaluate policy=runs/first/policy.npz
   # another stage, and the planar body
   python -m swarmjax.evaluate policy=runs/first/policy.npz stage=s3 robot=planar
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
     try:
         with life.progress("evaluate") as progress:
-            # Says which settings come from the policies before judging, which takes a minute.
+            # Before the episodes, which take a minute, says which settings come from the policies.
             announce = partial(words.say, f"swarmjax.evaluate: {said}")
             evaluation = evaluate(settings, None, progress, announce)
     except KeyboardInterrupt:

@@ -1,7 +1,7 @@
-"""Cells: sets of levels for judging policies, drawn from numbers or read from a file.
+"""Cells: sets of levels to evaluate policies on, drawn from a seed or read from a file.
 
-A suite is a list of cells. A cell may have a digest of its levels. By comparing digests, everybody
-who draws the levels can check that every bit is the same. Levels of a suite are drawn for the
+A suite is a list of cells. A cell may have a digest of its levels. Whoever draws the
+levels can compare digests to check that every bit is the same. Levels of a suite are drawn for the
 nominal e-puck.
 """
 
@@ -184,7 +184,7 @@ def _arrays(cell: Cell) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, suite: Suite) -> None:
-    """Writes levels that no settings describe; docs/evaluation.md lists the fields.
+    """Writes the levels of a suite to a file; docs/evaluation.md lists the fields.
 
     Args:
       path: Path of the .npz file.

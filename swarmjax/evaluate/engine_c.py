@@ -43,7 +43,7 @@ class Arenas(NamedTuple):
       data: [A] of `MjData`, positions up to date.
       factors: [A] factors of the episodes' robots.
       memory: [A] state of the robots' electronics.
-      target: [A, R, 2] targets of now, x (m), y (m).
+      target: [A, R, 2] current targets, x (m), y (m).
       obstacle: [A, M, 5] x (m), y (m), yaw (rad), half edges (m).
       level: [A] levels that the episodes started from.
       goal: [A] state of the goal.
@@ -139,7 +139,7 @@ def start(judge: Judge, levels: Sequence[level.Level]) -> Arenas:
 
     Args:
       judge: Data that the arenas share.
-      levels: [A], with the judge's numbers of robots and boxes.
+      levels: [A], with as many robots and boxes as the judge has.
 
     Returns:
       The arenas at rest, with their first observations.
@@ -296,7 +296,7 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
 def _turn(
     judge: Judge, arenas: Arenas, sight: Sight, pose: np.ndarray
 ) -> tuple[Turn, Level, Sight]:
-    """Asks the goal; returns its answer, levels with the new targets, and the sight of them."""
+    """Advances the goal; returns its turn, levels with new targets, and the sight of these."""
     levels, before = arenas.level._replace(target=arenas.target), arenas.outcome
     view = electronics.view(sight, pose, levels, before.arrived, before.clock + 1)
     turn = judge.goal.turn(arenas.goal, levels, view)
@@ -343,8 +343,8 @@ def _drive(
     qpos = np.stack([data.qpos for data in arenas.data])
     if not np.isfinite(qpos).all():
         raise ConfigError(
-            "the physics broke down: some positions are not finite; give a sim.substeps of more "
-            f"than {judge.substeps}, or a robot closer to the e-puck."
+            "the physics broke down: some positions are not finite; raise substeps above "
+            f"{judge.substeps}, or give a robot closer to the e-puck."
         )
     return memory, body.pose(qpos, np)
 
@@ -367,7 +367,7 @@ def look(
     target: np.ndarray,
     obstacle: np.ndarray,
 ) -> Sight:
-    """Finds what the sensors can see.
+    """Computes what the sensors measure.
 
     Args:
       judge: Data that the arenas share.

@@ -1,7 +1,7 @@
-"""Judges policies on the training device and in the training engine, many arenas at once.
+"""Evaluates policies on the training device and in the training engine, many arenas at once.
 
-Levels, rules and figures are those of the other engine. This one is the training engine, with its
-analytic sensors and few solver steps. Published results come from MuJoCo C; this engine is cheap.
+Levels, rules and metrics are the same as with MuJoCo C. Sensors are analytic, and the solver takes
+few steps, as in training. Published results come from MuJoCo C; this engine is cheap.
 """
 
 import functools
@@ -35,7 +35,7 @@ from swarmjax.task.stage_config import StageConfig
 from swarmjax.task.world import World
 from swarmjax.training import rollout
 
-_ABOUT = ("policy", "activation", "observation", "action")  # what a program depends on, of `meta`
+_ABOUT = ("policy", "activation", "observation", "action")  # what a program needs from `meta`
 _WEIGHTS = ("layers", "log_std", "mean", "std", "memory")
 
 
@@ -45,7 +45,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
     Args:
       config: settings of the evaluation.
       half: [M, 2] half edges of the boxes in the levels, m.
-      arenas: number of levels that are judged together.
+      arenas: number of levels that run together.
 
     Returns:
       The world, still without a policy's limits and encoding.
@@ -78,14 +78,14 @@ def _largest(stage: StageConfig, half: np.ndarray) -> StageConfig:
 def play(
     world: World, levels: Level, trained: Policy, steps: int, *, sampled: bool = True
 ) -> Outcome:
-    """Runs an episode of each level with the policy of a file.
+    """Runs an episode of each level with a policy.
 
     Args:
       world: result of `load`.
       levels: [E] with all robots and obstacles of the world.
       trained: the policy.
       steps: control steps of an episode.
-      sampled: whether to draw the actions from the policy; otherwise they are its means.
+      sampled: whether to sample the actions from the policy; otherwise they are its means.
 
     Returns:
       [E] outcomes, as NumPy arrays.
@@ -102,7 +102,7 @@ def play(
     if np.any(broken):
         raise ConfigError(
             f"the physics of {int(np.sum(broken))} of {len(levels.side)} episodes broke down: some "
-            f"positions are not finite; give a sim.substeps of more than {world.physics.substeps}."
+            f"positions are not finite; raise substeps above {world.physics.substeps}."
         )
     return Outcome(*map(np.asarray, outcome))
 
@@ -117,7 +117,7 @@ def _program(
       world: result of `load`.
       steps: control steps of an episode.
       about: JSON of what a policy's description says under the keys `_ABOUT`.
-      sampled: whether to draw the actions.
+      sampled: whether to sample the actions.
       module: Flax module of an extension's network; None if there is none.
     """
     meta = json.loads(about)
@@ -146,7 +146,7 @@ def _program(
         trained = bare._replace(**weights, network=network)
 
         def act(memory: Any, arenas: EnvState) -> tuple[Any, Array]:
-            """Draws the actions [E, R, U] with the judge's random numbers, or takes the means."""
+            """Samples actions [E, R, U] with the judge's random numbers, or takes the means."""
             shape = (arenas.observation.shape[-2], len(meta["action"]["names"]))
             seed, clock = arenas.level.seed, arenas.clock
             normal = noise.normal(seed, clock, Stream.ACTION, shape, jnp) if sampled else 0.0
@@ -169,7 +169,7 @@ def run(
 
     Args:
       world: the compiled environment.
-      act: takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
+      act: chooses the actions.
       levels: [E].
       steps: control steps of an episode, at least 1.
       memory: memory at the start.
@@ -202,7 +202,7 @@ def _step(
     carry: _Carry,
     _: None,
 ) -> tuple[_Carry, None]:
-    """Moves the arenas [E] whose episodes are not over by a control step."""
+    """Advances the arenas [E] by a control step, except those whose episodes are over."""
     arenas, outcome, broken, memory = carry
     memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)
@@ -220,7 +220,7 @@ def _step(
 
 
 def _events(world: World, before: EnvState, after: EnvState, came: env.TimeStep) -> measures.Events:
-    """Returns the events of a control step; training has counted contacts and infrared."""
+    """Returns the events of a control step; `env.step` has counted contacts and infrared."""
     poses = jax.vmap(partial(physics.poses, world.physics))
     return measures.Events(
         start=poses(before.sim)[..., :2],

@@ -39,7 +39,7 @@ class Judge:
 
     Attributes:
       config: Settings of the evaluation.
-      policy: The policy that drives.
+      policy: The policy that drives the robots.
       stage: Stage of the levels, with scalar fields [].
       spacing: Sizes for drawing levels.
       drive: The robot's drive, with the range of commands that the policy was trained for.
@@ -50,7 +50,7 @@ class Judge:
       ids: Rows of the model's moving bodies.
       scene: The scene for infrared rays.
       geom_robot: For each geom, the robot whose contact geom it is, else -1.
-      geom_kind: For each geom, the index in `gaps.KINDS` of the thing that it belongs to.
+      geom_kind: For each geom, the index in `gaps.KINDS` of the object that it is part of.
       substeps: Physics steps of a control step.
       own: Function that computes the extension's observations [A, R, E] from a view [A]; None if
         there are none.
@@ -77,7 +77,7 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
     Args:
       config: Settings of the evaluation.
-      trained: The policy to judge.
+      trained: The policy to evaluate.
       half: [M, 2] half edges of the boxes in the coming levels, m. None means those of the
         stage's first level.
 
@@ -128,11 +128,11 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 
 
 def substeps(config: EvaluateConfig) -> int:
-    """Returns the physics steps of a control step; by default each is half as long as in training.
+    """Returns the physics steps per control step: on wheels, by default twice those of training.
 
-    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts separate sliding
-    surfaces, as all convex contacts do. The wheels hop by 1.3 mm with physics steps of 16 ms, and
-    by 0.8 mm with steps of 8 ms or less.
+    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts, like all
+    convex contact models, separate sliding surfaces. The wheels hop by 1.3 mm with physics steps of
+    16 ms, and by 0.8 mm with steps of 8 ms or less.
     """
     finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
     return finer * physics_substeps(config.robot, config.substeps)
@@ -173,7 +173,7 @@ def _observations(extensions: Extensions, trained: Policy) -> tuple[Observation,
 
 
 def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
-    """Makes the goal; that of an extension runs with JAX."""
+    """Makes the goal. A goal of an extension runs in JAX."""
     goal = task_goals.load(config.task, config.robot, extensions.goals)
     own = [piece for piece in extensions.goals if piece.name == config.task.goal]
     if not own:
@@ -183,14 +183,14 @@ def _load_goal(config: EvaluateConfig, extensions: Extensions) -> Goal:
     taken = sorted({*goal.measures} & {*MEASURES})
     if taken:
         raise ConfigError(
-            f"goal {config.task.goal} must rename {', '.join(taken)}, which every goal measures."
+            f"goal {config.task.goal} measures {', '.join(taken)}, as every goal does: rename them."
         )
     own_goals.check(own[0], goal, config.robot, config.stage.robots, config.stage.obstacles)
     return own_goals.SideBySide(goal)
 
 
 def _look_by(own: tuple[Observation, ...]) -> Callable[[View], np.ndarray] | None:
-    """Compiles observations of an extension, for arenas side by side."""
+    """Compiles observations of an extension, for many arenas at once."""
     if not own:
         return None
     import jax  # only for extensions
@@ -269,7 +269,7 @@ def draw_level(
       spacing: Sizes.
       seed: Seed of the evaluation.
       episode: Number of the episode.
-      drawings: An extension's ways of drawing levels, in the order of `stage.drawing`.
+      drawings: Level drawings of an extension; `stage.drawing` counts them from 1.
 
     Returns:
       The level, as NumPy arrays.

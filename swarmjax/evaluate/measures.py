@@ -1,4 +1,4 @@
-"""The outcome of episodes, and the figures for comparing policies. No JAX.
+"""The outcome of episodes, and the measures that compare policies. No JAX.
 
 Every measure is one number per level; docs/evaluation.md gives its formula. The engines pass the
 events of each control step to `tally`, and nothing here depends on the engine.
@@ -22,7 +22,7 @@ STILL_TIME = 5.0  # s
 
 
 class Outcome(NamedTuple):
-    """The outcomes of episodes, final or so far.
+    """The outcomes of episodes that are over or still running.
 
     Attributes:
       clock: [A] control steps since the start.
@@ -82,7 +82,7 @@ class Events(NamedTuple):
 
 
 def begin(place: Any, xp: Any, own: int = 0) -> Outcome:
-    """Returns the outcome of episodes that have just begun.
+    """Returns the initial, empty outcome of episodes.
 
     Args:
       place: [A, R, 2] starts of the robots, m.
@@ -166,8 +166,8 @@ def per_level(
       outcome: Outcome of finished episodes.
       control_step: Length of a control step, s.
       steps: Control steps until the time is out.
-      shortest: [A, R] length of the shortest way from start to target, m, inf if there is none.
-        Without `shortest` there is no path efficiency.
+      shortest: [A, R] length of the shortest path from start to target, m, inf if there is none;
+        None to leave out path efficiency.
       own: Names of the goal's own measures.
 
     Returns:
@@ -205,7 +205,7 @@ def _efficiency(outcome: Outcome, shortest: np.ndarray) -> np.ndarray:
     """Computes success weighted by path length for each robot, [A, R], 0 to 1.
 
     Anderson et al. 2018, "On Evaluation of Embodied Navigation Agents", equation 1: success times
-    shortest / max(driven, shortest). A way of length 0 counts as driven perfectly.
+    shortest / max(driven, shortest). A shortest path of length 0 counts as 1.
     """
     longer = np.maximum(outcome.path, shortest)
     known = np.isfinite(longer)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 CORNER = 4  # points for each round corner
-GOAL = 24  # points on the circle around a target, used if the straight way to its centre is blocked
-_DETOUR = 0.2  # m; length by which a way is first allowed to exceed the straight line
+GOAL = 24  # points on the circle around a target, used if the line to its centre is blocked
+_DETOUR = 0.2  # m; length by which a path is first allowed to exceed the straight line
 _SLACK = 1e-6  # m; touching does not block
 _SIGNS = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
 
@@ -220,7 +220,7 @@ def _within(points: np.ndarray, inside: float | np.ndarray) -> np.ndarray:
 
 
 def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float) -> np.ndarray:
-    """Tells whether boxes [..., 5] block a disc's straight ways between points [..., 2], [...]."""
+    """Tells whether boxes [..., 5] block a disc on straight lines between points [..., 2]."""
     start, way = _into(first - box[..., :2], box), _into(second - first, box)
     return _meets(start, way, np.moveaxis(box[..., 3:], -1, 0), hull - _SLACK)
 

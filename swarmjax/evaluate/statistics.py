@@ -1,9 +1,9 @@
 """Point estimates and their intervals, with NumPy alone.
 
-Evaluation, benchmarks and studies compute their reported figures here, after Agarwal et al. 2021,
+Evaluation, benchmarks and studies compute their statistics here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
-4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]. A run is a
-training seed, and a task is a level or a stage on which the run's policy was judged.
+4.3) with percentile intervals of a bootstrap (section 4.1). Values have shape [runs, tasks]. A
+run is a training seed, and a task is a level or a stage on which the run's policy was evaluated.
 
 A bootstrap draws with replacement the part of the data that its interval is about, and takes the
 rest as given. The right draw depends on how the values were produced:
@@ -11,7 +11,7 @@ rest as given. The right draw depends on how the values were produced:
 =================  ==========================================  ==================================
 draw               each resample                               the interval is about
 =================  ==========================================  ==================================
-`runs`             draws runs with all their tasks             other runs, each judged on all
+`runs`             draws runs with all their tasks             other runs, each tested on all
                                                                these tasks
 `tasks`            draws tasks with all their runs             these runs, all on the same other
                                                                tasks
@@ -21,8 +21,8 @@ draw               each resample                               the interval is a
 
 Drawing dependent values independently makes an interval too narrow. For example, if all runs meet
 the same levels, a hard level is hard for all of them, and drawing levels for each run would average
-this difficulty out. The last draw errs on the wide side, because it counts the spread of single
-values twice (Owen 2007, "The pigeonhole bootstrap"). The error is small if there are many tasks.
+this difficulty out. With `runs_and_tasks`, intervals are too wide, because the spread of single
+values counts twice (Owen 2007, "The pigeonhole bootstrap"). With many tasks, the error is small.
 
 Values may be inf, for example the steps to a threshold that was never reached. Inf counts as larger
 than every number. A mean that includes inf is inf, and an end of an interval is inf if too many
@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
 # With two runs, half of all resamples hold one run twice, so the interval would just span both.
 LEAST_DRAWN = 3
-CONFIDENCE = 0.95  # of every interval
+CONFIDENCE = 0.95  # level of every interval
 RESAMPLES = 2000
 
 type Draw = Literal["runs", "tasks", "runs_and_tasks"]
@@ -66,7 +66,7 @@ def iqm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> np.float64 |
     """Computes the interquartile mean: the mean without the lowest and highest quarter of values.
 
     A quarter is rounded down to whole values, as in `scipy.stats.trim_mean(x, 0.25)`. So three
-    values or fewer are not trimmed. In rliable this mean is called the IQM.
+    values or fewer are not trimmed.
 
     Args:
       x: [...] values in any unit; if more than a quarter of them are inf, the result is inf.
@@ -95,8 +95,8 @@ def cvar(
     """Computes the conditional value at risk: the mean of the worst share of the values.
 
     It follows Rockafellar & Uryasev 2000, "Optimization of conditional value-at-risk". The share is
-    rounded up to whole values, so it is never empty. If each level was tried only once, the result
-    is worse than a result from the levels' expected values, because it also reflects chance.
+    rounded up to whole values, so it is never empty. If each level was tried only once, chance
+    makes the result worse than that of the levels' expected values.
 
     Args:
       x: [...] of any unit.
@@ -311,7 +311,7 @@ type _Index = tuple[np.ndarray, np.ndarray]
 
 
 class _How(NamedTuple):
-    """How values [runs, tasks] are drawn: arguments of `bootstrap`, and values a resample."""
+    """How values [runs, tasks] are drawn: arguments of `bootstrap`, and values per resample."""
 
     draw: Draw
     strata: Sequence[int] | None
@@ -340,7 +340,7 @@ def _all(shape: tuple[int, ...]) -> _Index:
 def _resampled(
     compute: Callable[..., np.ndarray], how: _How, *shapes: tuple[int, ...]
 ) -> Interval[float]:
-    """Computes the percentile interval of a figure of tables with these shapes.
+    """Computes the percentile interval of a statistic of tables with these shapes.
 
     The interval's ends are draws, never mixtures of two draws, because a mixture of inf and inf
     would be nan.

@@ -13,7 +13,7 @@ from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig, complete
 
 # Seeds of a suite's levels begin here. People and benchmarks choose small seeds, so they draw other
-# levels. Training uses another generator altogether, JAX's.
+# levels. Training uses another generator, JAX's.
 SUITE_SEED = 1_000_000
 
 

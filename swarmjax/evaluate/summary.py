@@ -32,7 +32,7 @@ def result(
     Args:
       config: Settings of the evaluation.
       suite: Its name, or None.
-      sides: Policies of one recipe, or of two recipes to compare, equally many of each.
+      sides: Policies of one recipe, or of two recipes to compare, with as many policies each.
       trials: Their results, one for each cell, with the rows of the first side first.
 
     Returns:
@@ -74,7 +74,7 @@ def _figures(
 
 
 def about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
-    """Describes under which settings an evaluation runs, as plain data for JSON.
+    """Describes the settings of an evaluation as plain data for JSON.
 
     Args:
       config: Settings of the evaluation.
@@ -93,7 +93,7 @@ def about(config: EvaluateConfig, suite: str | None) -> dict[str, Any]:
 
 
 def about_cell(config: EvaluateConfig, cell: Cell) -> dict[str, Any]:
-    """Describes the levels of a cell, and the settings that it has for itself.
+    """Describes the levels of a cell, and its own settings.
 
     Args:
       config: Settings of the evaluation.
@@ -152,7 +152,7 @@ def _summary(table: np.ndarray, measure: Measure, strata: Sequence[int] | None) 
 
 
 def _are_enough(table: np.ndarray, strata: Sequence[int] | None) -> bool:
-    """Tells whether levels [P, E] can be drawn: a group of one level has no spread."""
+    """Tells whether each group has enough levels [P, E] to draw from."""
     return min(strata or [table.shape[1]]) >= LEAST_DRAWN
 
 
@@ -167,7 +167,7 @@ def _draw(table: np.ndarray) -> Draw:
 def _pool(trials: Sequence[Trial], *, is_one: bool) -> dict[str, Any] | None:
     """Summarises the levels of all cells together.
 
-    Returns None for a single cell, and if cells share levels. Figures of cells that share levels
+    Returns None for a single cell, and if cells share levels. Results of cells that share levels
     are not independent, but the intervals draw the levels of each cell independently.
     """
     cells = [trial.cell for trial in trials]
@@ -178,7 +178,7 @@ def _pool(trials: Sequence[Trial], *, is_one: bool) -> dict[str, Any] | None:
 
 
 def _share(a: Cell, b: Cell) -> bool:
-    """Tells whether cells share a level, even if obstacles' shape and realism differ."""
+    """Tells whether cells have the same stage and seed, and a level number in common."""
     alike = a.seed == b.seed and replace(a.stage, name=b.stage.name) == b.stage
     return alike and bool(np.isin(a.episodes, b.episodes).any())
 

@@ -29,7 +29,7 @@ _COLUMNS = (
 
 
 def console() -> Console:
-    """Returns a console for standard output, without lines that are too long."""
+    """Returns a console for standard output, with lines of at most `words.WIDTH` letters."""
     found = Console()
     found.width = min(found.width, words.WIDTH) if found.is_terminal else words.WIDTH
     return found
@@ -74,7 +74,7 @@ def _names(side: Sequence[Mapping[str, str]]) -> str:
 
 
 def make_table(console: Console, *heads: str) -> Table:
-    """Makes a table without rows; a long name in its first column is broken, but no number."""
+    """Makes a table without rows. Long names in the first column wrap; numbers do not."""
     form, left = box.SIMPLE if console.is_terminal else None, int(len(heads) < 9)
     table = Table(box=form, padding=(0, 1, 0, left))
     for i, head in enumerate(heads):

@@ -1,8 +1,8 @@
 """The robot and the task that a policy was trained with, from its file.
 
 Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
-the command line sets them. The judge's body and the friction of hulls do not come from the file. By
-default the body has wheels and hulls rub as in Webots, so that all policies are judged alike.
+the command line sets them. The body and the friction of hulls do not come from the file: by default
+the body has wheels and hulls rub as in Webots, so that the conditions are equal for all policies.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -20,7 +20,7 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import stage_files
 from swarmjax.task.config import TaskConfig, describe
 
-# Keys of the task that a judge needs too; rewards and step limit matter only in training.
+# Keys of the task that an evaluation needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "goal", "target_speed", "arrival", "observations")
 # Keys of the robot that a policy file holds in `meta.sensors`.
 _SENSORS = {
@@ -38,9 +38,9 @@ class Trained(NamedTuple):
 
     Attributes:
       robot: Settings of the robot.
-      task: Settings of the task that a judge needs too.
+      task: Settings of the task that an evaluation needs too.
       realism: Realism of sensors and bodies.
-      stages: Plain data of the training's stages in order; none if the file names none.
+      stages: Plain data of the stages of training, in order; empty if the file names none.
     """
 
     robot: RobotConfig

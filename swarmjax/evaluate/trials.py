@@ -30,7 +30,7 @@ BATCH = 64  # arenas that share NumPy's cost per call; larger batches gain littl
 
 
 class Entrant(NamedTuple):
-    """A policy to judge, and the path of its file."""
+    """A policy to evaluate, and the path of its file."""
 
     path: str
     policy: Policy
@@ -84,7 +84,7 @@ def run(
     entrants: Sequence[Entrant],
     report: Callable[[int], None] = lambda _: None,
 ) -> Iterator[Trial]:
-    """Judges policies on cells.
+    """Evaluates policies on cells.
 
     Args:
       config: Settings of the evaluation.
@@ -111,8 +111,8 @@ def specialise(config: EvaluateConfig, cell: Cell) -> EvaluateConfig:
 
     Args:
       config: Settings of the evaluation.
-      cell: Cell that sets the stage and seed. A cell with a realism sets it too, and a cell with a
-        step limit if `config` has none.
+      cell: Cell whose stage and seed to use, its realism if it has one, and its step limit if
+        `config` has none.
 
     Returns:
       The settings.
@@ -136,7 +136,7 @@ def _try(
 ) -> Trial:
     """Builds a trial from the policies' outcomes on a cell."""
     goal = goals.load(config.task, config.robot, extension.load(config.extensions).goals)
-    # The shortest way is that to a target that stays.
+    # Path efficiency is not defined for targets that move.
     known = None if goal.moves else shortest
     shortest = np.zeros_like(shortest) if goal.moves else shortest
     second, steps, own = config.task.control_step, config.step_limit, goal.measures
@@ -218,7 +218,7 @@ def work[Job, Result](
 
 
 def _begin_worker() -> None:
-    """Prepares a process that judges."""
+    """Prepares a worker process."""
     # Ctrl-C ends the process at once and silently; its parent prints the message.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -251,7 +251,7 @@ def ways(config: EvaluateConfig, levels: Level) -> np.ndarray:
       levels: [E].
 
     Returns:
-      [E, R] m; inf where there is no path for any robot.
+      [E, R] m; inf where there is no path.
     """
     start, hull, reach = levels.start[..., :2], config.robot.hull_radius, config.task.target_radius
     return shortest_path.shortest(levels.side, start, levels.target, levels.obstacle, hull, reach)

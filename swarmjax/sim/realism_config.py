@@ -14,7 +14,7 @@ from swarmjax.sim.config import (
     MOST_FRICTION,
 )
 
-_LONGEST = 3600.0  # s; far more than is useful, since a training episode takes 16 s
+_LONGEST = 3600.0  # s; a training episode takes 16 s
 _MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
 _LATENCY_REASON = "every arena stores one command or observation for each control step of latency"
 # Settings that act on sensor counts. `ideal` sensors report metres, so they have no such settings.

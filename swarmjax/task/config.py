@@ -157,8 +157,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
 def resolve_encoding(task: TaskConfig, realism: RealismConfig) -> Literal["metric", "webots"]:
     """Returns the encoding of observations.
 
-    `metric` observes metres and radians. `webots` observes counts / 1023, distance / 1.5 m and
-    (bearing + pi) / (2 pi), as in deepworlds' find_and_avoid.
+    `metric` observes metres and radians. `INPUTS` of observation.py has the scales of `webots`.
     """
     if task.encoding != "auto":
         return task.encoding

@@ -1,8 +1,7 @@
 """A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
 
-Motors and sensors connect the policy to the arena. This module applies the realism
-factors to them, both in training and in evaluation. A factor that is off has no effect. With all
-factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
+This module applies the realism factors to motors and sensors, both in training and in evaluation.
+With all factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
 """
 
 from collections.abc import Sequence
@@ -173,7 +172,7 @@ def begin(
       electronics: electronics of the program.
       factors: factors of the episode.
       sight: exact sensor quantities at the start.
-      clock: [...] or [] control steps since the start, which are 0.
+      clock: [...] or [] zero.
       xp: `numpy` or `jax.numpy`.
 
     Returns:

@@ -173,9 +173,7 @@ def step[S: EnvState](world: World, state: S, action: Array) -> tuple[S, TimeSte
     active = state.level.present & world.goal.drives(state.arrived)
     clock = state.clock + 1
     data, memory, pose, sound = _move(world, state, action, active)
-    looked, around = _look(
-        world, pose, state.level, state.factors
-    )  # with the targets from before the step
+    looked, around = _look(world, pose, state.level, state.factors)  # at the old targets
     turn, level, sight = _turn(world, state, looked, pose, clock)
     arrived, ends = turn.arrived, world.goal.terminates(state.arrived, turn.arrived, level.present)
     sight = _look_by_extension(world, sight, pose, level, arrived, clock)

@@ -122,7 +122,6 @@ def draw(
     - Gain and yaw: each sensor draws its own.
     - Reflectance: each obstacle and each robot draws its own. All walls of the arena share one
       reflectance.
-    - Friction: each robot draws the friction of its wheels on the floor.
 
     Args:
       seed: [...] uint32, one per episode.

@@ -9,8 +9,8 @@ path (Wijmans et al. 2020, "DD-PPO", section 4).
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
 corners, so a robot that touches an obstacle is outside the widened one. Path lengths are therefore
 between a millimetre too short and three centimetres too long. A gap of 59 to 74 mm counts as
-passable, but no robot fits through. Neither error matters to the reward, which needs the right way around the
-obstacles, and a length that shrinks along that way.
+passable, but no robot fits through. Neither error matters to the reward, which needs only a
+length that shrinks along the right way around the obstacles.
 """
 
 from collections.abc import Callable

@@ -26,9 +26,8 @@ Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
 MOST_CELLS = 48  # largest number of cells in a row, and largest number of rows
-# Starts and targets may be placed on a set of points. The numbers below are the least distance
-# between two points (m), and the largest number of points. An area with more cells than this number
-# gets one point per cell.
+# Starts and targets are placed on points. The numbers below are the points' least distance (m) and
+# their largest number. An area with more cells than this number gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024
 
 

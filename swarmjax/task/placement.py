@@ -1,8 +1,8 @@
 """Places objects one after the other on the points of a lattice, in integers.
 
 With integer arithmetic, NumPy and JAX choose the same point from the same uniform number. The unit
-is 1/4096 m. This is a power of two, so lengths convert to metres exactly. The unit is large enough
-that squared distances within the largest arena fit an int32.
+is 1/4096 m, a power of two, so lengths convert to metres exactly. It is large enough that squared
+distances within the largest arena fit an int32.
 """
 
 import math

@@ -615,7 +615,7 @@ def test_physics_that_breaks_down_is_refused(
     judge = _judge(tmp_path, _stage(robots=2))
     arenas = _start(judge, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
     arenas.data[0].qvel[3] = np.nan
-    with pytest.raises(ConfigError, match=r"^the physics broke down.*sim\.substeps.*\.$"):
+    with pytest.raises(ConfigError, match=r"^the physics broke down.* substeps .*\.$"):
         engine_c.step(judge, arenas)
 
 
