@@ -1,7 +1,6 @@
 """`python -m swarmjax.evaluate policy=FILE suite=stages`: evaluates policies on new levels.
 
-`cells.py` draws the levels, `trials.py` runs the episodes, and `summary.py` summarises them. This
-module joins them, and writes and shows the result.
+The result is printed, and written to files with `out`.
 
 Examples:
   # 1,000 levels of the policy's last stage, on wheels

@@ -242,12 +242,12 @@ def step(judge: Judge, arenas: Arenas, action: np.ndarray | None = None) -> Aren
 
     Args:
       judge: Data that the arenas share.
-      arenas: Their state before.
+      arenas: Their state before the step.
       action: [A, R, U] actions of the robots, -1..1; None: the policy chooses them, and must have
         no memory.
 
     Returns:
-      Their state after.
+      Their state after the step.
 
     Raises:
       ConfigError: A position is not finite.

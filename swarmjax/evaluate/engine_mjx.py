@@ -48,7 +48,7 @@ def load(config: EvaluateConfig, half: np.ndarray, arenas: int) -> World:
       arenas: number of levels that run together.
 
     Returns:
-      The world, still without a policy's limits and encoding.
+      The world, without the speed limits and encoding of a policy.
 
     Raises:
       ConfigError: a box is larger than a stage allows.
@@ -170,7 +170,7 @@ def run(
     Args:
       world: the compiled environment.
       act: chooses the actions.
-      levels: [E].
+      levels: [E] levels.
       steps: control steps of an episode, at least 1.
       memory: memory at the start.
 

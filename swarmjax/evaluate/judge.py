@@ -43,8 +43,8 @@ class Judge:
       stage: Stage of the levels, with scalar fields [].
       spacing: Sizes for drawing levels.
       drive: The robot's drive, with the range of commands that the policy was trained for.
-      electronics: The electronics between policy and world, with the observations of the policy's
-        training.
+      electronics: The electronics between policy and world, with the observations that the policy
+        was trained on.
       goal: What the robots are asked to do.
       model: The compiled arena.
       ids: Rows of the model's moving bodies.

@@ -1,7 +1,7 @@
 """The outcome of episodes, and the measures that compare policies. No JAX.
 
-Every measure is one number per level; docs/evaluation.md gives its formula. The engines pass the
-events of each control step to `tally`, and nothing here depends on the engine.
+Every measure is one number per level; docs/evaluation.md gives its formula. Both engines
+pass the events of each control step to `tally`.
 """
 
 from collections.abc import Collection

@@ -110,7 +110,7 @@ def _near_way(
     """Computes the length of the shortest path of one robot past obstacles [M, 5], m.
 
     A path stays within an ellipse around its ends. If the shortest path past the obstacles in an
-    ellipse is short enough to stay in it, it meets no others.
+    ellipse is short enough to stay in it, it meets no other obstacle.
     """
     apart = [np.linalg.norm(obstacle[:, :2] - end, axis=-1) for end in (start, target)]
     least = apart[0] + apart[1] - 2.0 * (np.hypot(*obstacle[:, 3:].T) + hull)
@@ -133,8 +133,8 @@ def _way(arena: _Arena, start: np.ndarray, target: np.ndarray, reach: float) -> 
     """Computes the length of the shortest path of one robot, m; inf if there is none.
 
     This is A* on the visibility graph (Hart, Nilsson & Raphael 1968, "A formal basis for the
-    heuristic determination of minimum cost paths"). A line is tested when the search comes to its
-    beginning, and only if it could be part of a shortest path.
+    heuristic determination of minimum cost paths"). A line is tested only when the search is at its
+    first point, and if it could be part of a shortest path.
     """
     boxes, inside = arena.boxes, arena.inside
     circle = _clear(_circle(target, reach, inside), boxes, inside)
@@ -226,7 +226,7 @@ def _barred(first: np.ndarray, second: np.ndarray, box: np.ndarray, hull: float)
 
 
 def _meets(start: np.ndarray, way: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
-    """Tells whether lines from `start` along `way` [2, ...] come within a radius of boxes at 0.
+    """Tells whether lines from `start` along `way` [2, ...] come within a radius of centred boxes.
 
     A line does so if it enters the box, with half edges [2, ...], after the box is widened by the
     radius. That shape consists of two boxes, each longer by the radius at both ends of one axis,

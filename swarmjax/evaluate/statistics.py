@@ -150,7 +150,7 @@ def bootstrap(
       Estimate and interval, in the unit of the statistic.
 
     Raises:
-      ValueError: the values are refused.
+      ValueError: a value is nan or -inf, or there are too few runs or tasks.
     """
     table = _table("values", values, draw)
     how = _How(draw, strata, resamples, table.size)

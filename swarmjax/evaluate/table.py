@@ -29,7 +29,7 @@ _COLUMNS = (
 
 
 def console() -> Console:
-    """Returns a console for standard output, with lines of at most `words.WIDTH` letters."""
+    """Returns a console for standard output, at most `words.WIDTH` letters wide."""
     found = Console()
     found.width = min(found.width, words.WIDTH) if found.is_terminal else words.WIDTH
     return found
@@ -40,7 +40,7 @@ def show(console: Console, result: Mapping[str, Any]) -> None:
 
     Args:
       console: Console to print on.
-      result: Result of `summary`, for policies or for a comparison.
+      result: From `summary.result`, for policies or for a comparison.
     """
     cells = result["cells"]
     sides = result.get("compared", [result.get("policies")])

@@ -1,8 +1,8 @@
 """The robot and the task that a policy was trained with, from its file.
 
 Commands that run a policy take hull, sensors, speeds, task, realism and stage from its file, unless
-the command line sets them. The body and the friction of hulls do not come from the file: by default
-the body has wheels and hulls rub as in Webots, so that the conditions are equal for all policies.
+the command line sets them. Body and hull friction do not come from the file: by default, all
+policies get the wheeled body and the hull friction of Webots.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -97,7 +97,7 @@ def load[C: Section](
 
     Raises:
       ConfigError: An argument is invalid or not read here, or policies were trained differently and
-        no argument decides.
+        no argument says which value to use.
       PolicyError: A policy is invalid.
     """
     if "task.step_limit" in files.parse(cls, typed):

@@ -1,4 +1,4 @@
-"""A robot's electronics: commands on their way to the wheels, sensors on their way to the policy.
+"""A robot's electronics: the path of commands to the wheels, and of readings to the policy.
 
 This module applies the realism factors to motors and sensors, both in training and in evaluation.
 With all factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
@@ -166,7 +166,7 @@ def reflectance(factors: Factors) -> infrared.Reflectance | None:
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode. Until delayed values arrive, commands are 0 and observations the first.
+    """Starts an episode. Until delayed values arrive, commands are 0 and observations initial.
 
     Args:
       electronics: electronics of the program.

@@ -100,7 +100,7 @@ def check(chosen: Chosen, robot: RobotConfig, robots: int, obstacles: int) -> No
       obstacles: M.
 
     Raises:
-      ConfigError: a piece does so; the message says what it should return.
+      ConfigError: a piece returns a wrong shape or type; the message gives the right one.
     """
     drawn = level_shapes(robots, obstacles)
     seen = view_shapes(drawn, robot)

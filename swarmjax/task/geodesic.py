@@ -1,10 +1,10 @@
 """Distance to the target along the shortest path around walls and boxes.
 
 A visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths
-Among Polyhedral Obstacles") is solved once per episode for every target. For each corner that a
-robot can see, the distance to the corner and the distance from there to the target are then added.
-The smallest of these sums is the robot's distance. Navigation rewards count progress along this
-path (Wijmans et al. 2020, "DD-PPO", section 4).
+Among Polyhedral Obstacles") is solved once per episode for every target. A
+robot's path is then the straight line, if it is free, or the shortest path through a corner that
+the robot can see. Navigation rewards count progress along this path (Wijmans et al. 2020,
+"DD-PPO", section 4).
 
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
 corners, so a robot that touches an obstacle is outside the widened one. Path lengths are therefore

@@ -12,7 +12,7 @@ _MOST_COUNTED = 64
 def nearest(distance: Array, count: int) -> Array:
     """Orders objects by distance.
 
-    The function counts how many objects are nearer than each one. For rows this short, this is
+    The function counts how many objects are nearer than each one. For few objects, this is
     faster than sorting (docs/performance.md).
 
     Args:

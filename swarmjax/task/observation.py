@@ -1,8 +1,8 @@
 """Observations: only this module defines which entries exist, and in which order.
 
 `INPUTS` is the table of built-in entries. Other modules take names, units and sizes from `layout`.
-To add an input, add one row to `INPUTS`, its names to `extension.TAKEN` and, if the input is a new quantity, one
-field to `Readings`.
+To add an input, add one row to `INPUTS`, its names to `extension.TAKEN` and, if the input is a new
+quantity, one field to `Readings`.
 """
 
 import math

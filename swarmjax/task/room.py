@@ -82,7 +82,7 @@ def _levels(
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level that has no room for its robots; without JAX."""
+    """Refuses a level that has no room for its robots. Needs no JAX."""
     arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
     problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
     if not problem and (arrived & drawn.present).any():
@@ -95,7 +95,7 @@ def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
 
 
 def _check_own(own: LevelDrawing, stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level of an extension, whose targets may overlap."""
+    """Refuses an extension's level with a fault; its targets may overlap."""
     from swarmjax.task import extended  # with JAX
 
     problem = _problem(extended.redraw(own, drawn), spacing, ("robot", "wall"), ("wall",))

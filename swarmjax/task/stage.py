@@ -19,7 +19,7 @@ Array = Any
 
 
 class Stage(NamedTuple):
-    """One stage ([]) or all of them ([S]).
+    """One stage, with fields [], or all stages, with fields [S].
 
     Attributes:
       robots: number of robots, int32.

@@ -118,7 +118,7 @@ class Goal:
         return view.distance <= self.sizes.target_radius
 
     def drives(self, arrived: Array) -> Array:
-        """Returns which robots [..., R] obey their commands, after some have arrived."""
+        """Returns which robots [..., R] obey their commands, given which have arrived."""
         return ~arrived if self.ends == "each" else ~arrived | True
 
     def is_under_way(self, arrived: Array) -> Array:
@@ -132,7 +132,7 @@ class Goal:
         return over & False if self.ends == "never" else over
 
     def terminates(self, before: Array, arrived: Array, present: Array) -> Array:
-        """Returns for which robots [..., R] nothing more can be earned after a control step."""
+        """Returns which robots [..., R] can earn nothing more after this control step."""
         if self.ends == "each":
             return arrived & ~before
         return present & self.is_over(arrived, present)[..., None]

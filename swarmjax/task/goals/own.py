@@ -85,7 +85,7 @@ def _check_class(name: str, goal: Goal) -> None:
 
 
 def _check_shapes(name: str, first: Any, turn: Turn, robots: int) -> None:
-    """Refuses a turn with arrays of other shapes or types."""
+    """Refuses a turn with arrays of wrong shapes or types."""
     place, each = ((robots, 2), jnp.float32), ((robots,), bool)
     wanted = {"target of begin": (first, *place), "target": (turn.target, *place)}
     wanted |= {"arrived": (turn.arrived, *each)}
@@ -100,7 +100,7 @@ def _check_shapes(name: str, first: Any, turn: Turn, robots: int) -> None:
 
 
 def _check_state(name: str, before: Any, after: Any) -> None:
-    """Refuses a state that changes its shapes, or is no array or tuple of arrays."""
+    """Refuses a state that changes its shapes, or is neither an array nor a tuple of arrays."""
     if not _is_plain(before):
         raise ConfigError(
             f"{name} has a {type(before).__name__} as state: return an array or a tuple of arrays."

@@ -1,9 +1,9 @@
 """Arenas of hundreds of robots: each box, start and target has a plot of its own.
 
-Other levels place objects one after the other, clear of all earlier ones. That takes time in
-proportion to the square of the number of robots, and has too few points for a thousand of them.
-Here the arena is divided into a square grid of plots, which are dealt out at random. An object lies
-at random in its plot, but half of the least distance between objects away from the edges.
+Other levels place objects one after the other, clear of all earlier ones. Their time grows with
+the square of the number of robots, and their points are too few for a thousand. Here the arena is
+divided into a square grid of plots, which are dealt out at random. An object lies at random in its
+plot, but half of the least distance between objects away from the edges.
 """
 
 import math
