@@ -1,8 +1,8 @@
 """Curricula along axes: a stage and easier values of its keys become a grid of stages.
 
 With `curriculum.axes`, each combination of one value from every axis is a stage. The last value of
-an axis is the stage's own, so the last stage of the grid is the stage itself. From one stage to the
-next, the last axis changes fastest.
+an axis is the stage's own, so the last stage is the stage itself. From one stage to the next,
+the last axis changes fastest.
 """
 
 import itertools

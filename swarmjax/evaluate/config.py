@@ -11,8 +11,8 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task.config import TaskConfig, check_realism
 from swarmjax.task.stage_config import StageConfig
 
-# The robot's settings in an evaluation, unless a robot file or an argument sets them. Hulls rub on
-# hulls, boxes and walls as in Webots, where `coulombFriction` of ContactProperties is 1 by default.
+# The robot's settings in an evaluation, unless a robot file or an argument sets them. Hulls have
+# the friction of Webots, where `coulombFriction` of ContactProperties is 1 by default.
 JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
 STEPS = 1500  # control steps of an episode by default; Table 1 of the paper

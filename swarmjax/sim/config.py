@@ -107,7 +107,7 @@ class RobotConfig(Section):
     sensor_range: float = setting(epuck.SENSOR_RANGE, "infrared range, m", above=0.0, high=1.0)
     sensor_height: float = setting(
         epuck.SENSOR_HEIGHT,
-        "height of the infrared sensors above the floor, m; rays must meet other hulls",
+        "height of the infrared sensors, m; their rays must meet other hulls",
         above=epuck.HULL_BOTTOM,
         below=epuck.HULL_TOP,
     )

@@ -27,7 +27,7 @@ def _weight(default: float, meaning: str) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class RewardConfig(Section):
-    """Weights of the reward terms: those of the paper's equation 3, and penalties."""
+    """Weights of the reward terms: equation 3 of the paper, and penalties."""
 
     progress: float = _weight(1.0, "per metre that the robot comes nearer to its target")
     path_progress: float = _weight(

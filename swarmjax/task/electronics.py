@@ -279,7 +279,7 @@ def _read(
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
     """Returns [..., R] whether a sample was due in the control step that has just ended."""
-    clock = xp.asarray(clock, xp.float32)  # so that NumPy and JAX round alike, and sample alike
+    clock = xp.asarray(clock, xp.float32)  # so that NumPy and JAX round alike
     ended = clock[..., None] * control_step / period + _SLACK
     return xp.floor(ended) > xp.floor(ended - control_step / period)
 

@@ -50,7 +50,7 @@ class Ended(NamedTuple):
       episodes: 1 where an episode ended.
       stage: stage on which the episode began.
       cohort: cohort in which the episode began; -1 where no episode ended.
-      targets: number of robots present; each has one target.
+      targets: number of robots present.
       reached: number of robots that had arrived at the end.
       all_reached: 1 where every robot had arrived.
       steps: control steps of the episode.

@@ -110,8 +110,7 @@ def draw(
     """Draws the factors of an episode.
 
     Each factor has its own random numbers, so switching one off leaves the others unchanged.
-    Adding robots leaves the factors of the existing robots unchanged. `configs/realism/` holds the
-    ranges and their sources.
+    Adding robots leaves the factors of the existing robots unchanged.
 
     The factors are drawn per robot, per sensor or per surface, according to their cause:
 

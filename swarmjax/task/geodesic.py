@@ -214,8 +214,8 @@ def _frames(level: Level) -> Array:
 def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
     local = into_frame(level.obstacle[:, None, :3], place)
-    # Each pair of places uses these coordinates. Without the barrier, XLA inlines their computation
-    # into the code of every pair, and compiling takes minutes on a GPU.
+    # Without the barrier, XLA inlines this computation into the code of every pair of places, and
+    # compiling takes minutes on a GPU.
     return _Places(place, *jax.lax.optimization_barrier(local))
 
 

@@ -25,7 +25,7 @@ Array = Any
 Cell = tuple[int, int]  # row and column of the text, from 0
 
 WALL, FLOOR, START, TARGET = "#.ST"
-MOST_CELLS = 48  # largest number of cells in a row, and largest number of rows
+MOST_CELLS = 48  # most cells in a row, and most rows
 # Starts and targets are placed on points. The numbers below are the points' least distance (m) and
 # their largest number. An area with more cells than this number gets one point per cell.
 _APART, _MOST_POINTS = 0.03, 1024

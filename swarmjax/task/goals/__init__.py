@@ -1,4 +1,4 @@
-"""Goals, which define what robots are asked to do; `task.goal` names one.
+"""Goals: what robots are asked to do. `task.goal` names one.
 
 - goal.py: what every goal defines, and when episodes end. Start reading here.
 - navigate.py, lifelong.py, gather.py, cover.py: the built-in goals.

@@ -23,7 +23,7 @@ class Errands(NamedTuple):
       start: [..., R, 2] the starts of the level, m. Robots are sent to the starts and targets of
         the level, since all of them can be reached.
       target: [..., R, 2] the targets of the level, m.
-      taken: [..., R] index of each robot's target; 2 i is the target of robot i in the level, and
+      taken: [..., R] index of each robot's target; 2 i is robot i's own target, and
         2 i + 1 its start.
       count: [..., R] targets reached.
     """

@@ -50,7 +50,7 @@ class Moving(Navigate):
         xp = level.target.__array_namespace__()
         turn = super().advance(state, level, view)
         moved = level.target + state * self.sizes.control_step
-        # A target stays where a robot can reach it.
+        # A target turns back where a robot could not follow.
         most = (level.side / 2.0 - self.sizes.hull_radius)[..., None, None]
         velocity = xp.where(xp.abs(moved) > most, -xp.sign(moved) * xp.abs(state), state)
         target = xp.where(view.present[..., None], xp.clip(moved, -most, most), level.target)

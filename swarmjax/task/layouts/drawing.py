@@ -91,7 +91,7 @@ def draw(
     """Draws an arena with this layout.
 
     Args:
-      kind: the part that is fixed in the program.
+      kind: the fixed part.
       of: numbers of the layout in one stage, in fields [...].
       uniforms: [uniform_count(kind, R)] float32 in [0, 1), or more; the only source of randomness.
       present: [R] whether the robot is present.

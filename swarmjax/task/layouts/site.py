@@ -32,7 +32,7 @@ class Numbers(NamedTuple):
     apart: Array
 
 
-NUMBERS = Numbers._fields  # names of the stage's settings, which are in m
+NUMBERS = Numbers._fields  # names of a stage's settings, m
 
 
 class Site(NamedTuple):
