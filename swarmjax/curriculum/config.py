@@ -76,7 +76,7 @@ class CurriculumConfig(Section):
         "keep", "Adam's moments after a promotion; reset: 0 [mode=sequential or mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep", "exploration after a promotion; reset: as at first [mode=sequential or mixed]"
+        "keep", "exploration after a promotion; reset: as at the start [mode=sequential or mixed]"
     )
 
     def _check(self) -> None:

@@ -54,7 +54,7 @@ class JudgeConfig(Section):
     seed: int = setting(1, "random seed of the levels", 0, MAX_COUNT)
     workers: int | None = setting(None, "number of processes; null: one per core", 1, 1024)
     substeps: int | None = setting(
-        None, "physics steps per control step; null: the body's default", 1, 1000
+        None, "physics steps per control step; null: 1 (planar) or 4 (wheeled)", 1, 1000
     )
     extensions: str | None = setting(
         None, "Python file with the policies' extension; it is executed"

@@ -32,7 +32,7 @@ def result(
     Args:
       config: Settings of the evaluation.
       suite: Its name, or None.
-      sides: Policies of one recipe, or of two recipes to compare, with as many policies each.
+      sides: Policies of one recipe, or of two recipes to compare, the same number of each.
       trials: Their results, one for each cell, with the rows of the first side first.
 
     Returns:

@@ -53,7 +53,7 @@ class AlgoConfig(Section):
         "activation of the mean action; tanh: keeps it within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
-        "orthogonal", "first weights; uniform: in +-1 / sqrt(inputs), like biases, as in PyTorch"
+        "orthogonal", "first weights; uniform: weights and biases in +-1 / sqrt(inputs) (PyTorch)"
     )
     normalize_observations: bool = setting(
         True, "normalise observations by running mean and deviation; clipped to +-10 in any case"

@@ -31,7 +31,7 @@ class ReproduceConfig(Section):
 
     seeds: int = setting(10, "number of seeds in each arm", LEAST_DRAWN, 4096)
     budget: int = setting(BUDGET, "control steps of a seed; fewer give no verdicts", UPDATE, _MOST)
-    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded (1.5 m)", UPDATE, _MOST)
+    fine_tune: int = setting(FINE_TUNE, "budget of arms NAME_expanded, side 1.5 m", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
         None, "save and stop after this many minutes; resume=DIR continues", above=0.0

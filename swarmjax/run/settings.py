@@ -65,7 +65,7 @@ class TrainConfig(ProgramConfig):
         None, "run directory to continue; auto: run.dir, if it holds a run"
     )
     init_from: str | None = setting(
-        None, "run directory whose networks and normaliser training starts from"
+        None, "run directory that gives the first networks and normaliser"
     )
     stage_name: str = setting("", "name of the stage or of the curriculum", derived=True)
 

@@ -194,7 +194,7 @@ class SimConfig(Section):
         None, "obstacles to compile for; null: as many as the stages need, at least 4", 0, 256
     )
     substeps: int | None = setting(
-        None, "physics steps per control step; null: the body's default", 1, 1000
+        None, "physics steps per control step; null: 1 (planar) or 2 (wheeled)", 1, 1000
     )
 
     @property

@@ -166,7 +166,7 @@ def reflectance(factors: Factors) -> infrared.Reflectance | None:
 def begin(
     electronics: Electronics, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Memory, Array]:
-    """Starts an episode. Until delayed values arrive, commands are 0 and observations initial.
+    """Starts an episode. Until delayed values arrive, commands are 0 and observations the first.
 
     Args:
       electronics: electronics of the program.

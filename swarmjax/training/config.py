@@ -51,7 +51,7 @@ class ProgramConfig(Section):
     )
     streams: int | None = setting(
         None,
-        "number of random streams, a multiple of devices; runs with equally many draw the same "
+        "number of random streams, a multiple of devices; with equally many, runs draw the same "
         "random numbers on any number of devices; null: one for each device that shares the arenas",
         1,
         2**16,
