@@ -15,7 +15,7 @@ from swarmjax.task.stage_config import StageConfig
 # the friction of Webots, where `coulombFriction` of ContactProperties is 1 by default.
 JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
-STEPS = 1500  # control steps of an episode by default; Table 1 of the paper
+STEPS = 1500  # control steps of an episode by default; the paper's Table 1
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
 # What `trained_settings.load` takes from the policies, as `--help` shows it.
 AS_TRAINED = {

@@ -1,6 +1,6 @@
 """A robot's electronics: the path of commands to the wheels, and of readings to the policy.
 
-This module applies the realism factors to motors and sensors, both in training and in evaluation.
+This module applies the realism factors to motors and sensors, in training and evaluation.
 With all factors off, a policy observes the exact ray lengths, and the wheels turn as commanded.
 """
 

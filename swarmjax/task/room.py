@@ -82,7 +82,7 @@ def _levels(
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level that has no room for its robots. Needs no JAX."""
+    """Refuses a level that has no room for its robots."""
     arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
     problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
     if not problem and (arrived & drawn.present).any():

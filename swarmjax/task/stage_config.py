@@ -28,7 +28,7 @@ FILLING = 0.4  # share of a square grid's boxes that random placement can always
 
 BUILT_IN = ("random", "fixed", "map", *LAYOUTS)  # built-in kinds of levels
 # Up to these numbers, squared lengths fit an int32 and there are enough points for all objects.
-# They do not apply to `plots`.
+# `plots` may exceed them.
 _MOST_OBSTACLES, _MOST_ROBOTS, _LARGEST_SIDE = 112, 100, 4.0
 _SMALLEST_CELL = 0.08  # m; a robot of 0.074 m with 3 mm on either side
 _Length = float | tuple[float, float] | None
