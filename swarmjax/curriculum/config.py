@@ -21,16 +21,16 @@ _READ_BY: dict[str, tuple[str, Sequence[str]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class CurriculumConfig(Section):
-    """Settings: which arenas train on which stage, when that changes, and what a promotion changes.
+    """Settings: which arenas train on which stage, when that changes, and what a promotion resets.
 
     Some options have an effect only in some modes. Their descriptions name these modes in brackets.
     """
 
     mode: str = setting(
         "mixed",
-        "sequential: all arenas on the newest stage; mixed: most on the newest, some on earlier "
-        "stages; adaptive: on all stages, more on those with a higher score; frontier: on stages "
-        "whose easier neighbours are learned; or the name of an extension's curriculum",
+        "where arenas train; sequential: all on the newest stage; mixed: most on the newest, some "
+        "on earlier stages; adaptive: on all stages, more on those with a higher score; frontier: "
+        "on stages whose easier neighbours are learned; or the name of an extension's curriculum",
     )
     axes: dict[str, tuple[float | tuple[float, float], ...]] = field(
         default_factory=ByName,
@@ -46,24 +46,24 @@ class CurriculumConfig(Section):
     )
     threshold: float | tuple[float, ...] = setting(
         0.8,
-        "success at which a stage is learned: one number, or a list with one for each stage "
-        "[sequential, mixed, frontier]",
+        "success from which a stage counts as learned: one number, or a list with one per stage "
+        "[mode=sequential, mixed or frontier]",
         0.0,
         1.0,
     )
     budget_share: float = setting(
         0.5,
-        "share of the budget for all stages before the last, divided equally [sequential, mixed]",
+        "budget share of all stages before the last, in equal parts [mode=sequential or mixed]",
         above=0.0,
         below=1.0,
     )
     score: Literal["learnability", "failure"] = setting(
         "learnability",
-        "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [adaptive]",
+        "score of a stage with success p; learnability: p (1 - p); failure: 1 - p [mode=adaptive]",
     )
     floor: float = setting(
         0.1,
-        "share of the arenas that is spread evenly over all stages [adaptive, frontier]",
+        "share of the arenas that is spread evenly over all stages [mode=adaptive or frontier]",
         above=0.0,
         high=1.0,
     )
@@ -73,7 +73,7 @@ class CurriculumConfig(Section):
         "arenas, so that its weight is its share of all robots [adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
-        "keep", "what a promotion does to Adam's moments; reset: set them to 0 [sequential, mixed]"
+        "keep", "Adam's moments after a promotion; reset: 0 [mode=sequential or mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
         "keep", "SD of actions after a promotion; reset: algo.initial_std [sequential, mixed]"

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
         outputs.make_room("out", out, None if out.suffix == ".json" else out)
     try:
         with life.progress("evaluate") as progress:
-            # Says which settings come from the policies before judging, which takes a minute.
+            # Before the episodes, which take a minute, says which settings come from the policies.
             announce = partial(words.say, f"swarmjax.evaluate: {said}")
             evaluation = evaluate(settings, None, progress, announce)
     except KeyboardInterrupt:

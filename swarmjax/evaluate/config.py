@@ -17,9 +17,9 @@ JUDGED: Mapping[str, Any] = {"body": "wheeled", "hull_friction": 1.0}
 MOST_STEPS = 1_000_000  # control steps of an episode; nine hours
 STEPS = 1500  # control steps of an episode by default; Table 1 of the paper
 MOST_EPISODES = 1_000_000  # the levels of this many episodes take a few gigabytes
-# Values that `trained_settings.load` takes from the policies.
+# What `trained_settings.load` takes from the policies, as `--help` shows it.
 AS_TRAINED = {
-    "stage": "its last stage",
+    "stage": "the policy's last stage",
     "robot": "as trained, on wheels and with hulls of friction 1",
     "task": "as trained",
     "realism": "as trained",
@@ -28,7 +28,7 @@ AS_TRAINED = {
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeConfig(Section):
-    """The settings of all commands that judge policies: the levels, the robots and the world."""
+    """The settings shared by commands that evaluate policies: levels, robots and the world."""
 
     inherited: ClassVar[Mapping[str, str]] = AS_TRAINED
 
@@ -62,7 +62,7 @@ class JudgeConfig(Section):
 
     @property
     def step_limit(self) -> int:
-        """Control steps of an episode, unless a cell of a suite has its own number of steps."""
+        """Control steps of an episode, unless a suite's cell sets its own number."""
         return STEPS if self.steps is None else self.steps
 
     def _check(self) -> None:
@@ -71,7 +71,7 @@ class JudgeConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig(JudgeConfig):
-    """All settings of an evaluation of policies."""
+    """All settings of an evaluation."""
 
     command: ClassVar[str] = "evaluate"
 

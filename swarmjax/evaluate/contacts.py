@@ -1,4 +1,4 @@
-"""The contacts of robots, as MuJoCo's C engine finds them."""
+"""The contacts of robots that MuJoCo's C engine finds."""
 
 import numpy as np
 

@@ -169,8 +169,8 @@ def run(
 
     Args:
       world: the compiled environment.
-      act: takes a memory [E, R, H] or None, and arenas; returns the new memory, and actions.
-      levels: [E].
+      act: chooses the actions.
+      levels: [E] levels.
       steps: control steps of an episode, at least 1.
       memory: memory at the start.
 
@@ -202,7 +202,7 @@ def _step(
     carry: _Carry,
     _: None,
 ) -> tuple[_Carry, None]:
-    """Moves the arenas [E] whose episodes are not over by a control step."""
+    """Advances the arenas [E] by a control step, except those whose episodes are over."""
     arenas, outcome, broken, memory = carry
     memory, action = act(memory, arenas)
     moved, came = jax.vmap(partial(env.step, world))(arenas, action)

@@ -65,12 +65,12 @@ def evaluate(
 
 
 def _read(settings: EvaluateConfig) -> list[list[Entrant]]:
-    """Reads the policies to judge: of one recipe, or of the two recipes to compare."""
+    """Reads the policies to evaluate: of one recipe, or of the two recipes to compare."""
     return [evaluate_trials.read_policies(files, settings.extensions) for files in _sides(settings)]
 
 
 def _sides(settings: EvaluateConfig) -> list[list[str]]:
-    """Lists the files to judge: of one recipe, or of the two recipes to compare."""
+    """Lists the policy files: of one recipe, or of the two recipes to compare."""
     if settings.policy is not None:
         return [list_files("policy", settings.policy)]
     parts = (settings.compare or "").split(",")

@@ -130,9 +130,9 @@ def load(config: EvaluateConfig, trained: Policy, half: np.ndarray | None = None
 def substeps(config: EvaluateConfig) -> int:
     """Returns the physics steps of a control step: on wheels, by default twice those of training.
 
-    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts separate sliding
-    surfaces, as all convex contacts do. The wheels hop by 1.3 mm with physics steps of 16 ms, and
-    by 0.8 mm with steps of 8 ms or less.
+    When a robot is blocked, its slipping wheels hop, because MuJoCo's contacts, like all
+    convex contact models, separate sliding surfaces. The wheels hop by 1.3 mm with physics steps of
+    16 ms, and by 0.8 mm with steps of 8 ms or less.
     """
     finer = 2 if config.robot.body == "wheeled" and config.substeps is None else 1
     return finer * physics_substeps(config.robot, config.substeps)

@@ -1,7 +1,7 @@
 """The outcome of episodes, and the measures for comparing policies. No JAX.
 
-Every measure is one number per level; docs/evaluation.md gives its formula. The engines pass the
-events of each control step to `tally`, and nothing here depends on the engine.
+Every measure is one number per level; docs/evaluation.md gives its formula. Both engines
+pass the events of each control step to `tally`.
 """
 
 from collections.abc import Collection
@@ -22,12 +22,12 @@ STILL_TIME = 5.0  # s
 
 
 class Outcome(NamedTuple):
-    """The outcomes of episodes, final or so far.
+    """The outcomes of episodes that are over or still running.
 
     Attributes:
       clock: [A] control steps since the start.
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
-        within its target.
+        at its target.
       arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
         control steps until it came to its target for the last time.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.

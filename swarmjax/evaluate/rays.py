@@ -74,7 +74,7 @@ def cast_rays(
     for where, me, start, ways, geom, reach, face in rays:
         cast_one(where.model, where, start, ways, _RAY_GROUPS, True, me, geom, reach, face, 2, far)
     leaves = (normal * toward).reshape(-1, 2, 3).sum(axis=-1) > 0.0
-    ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: nothing there
+    ahead = np.where(distance[:, 0] < 0.0, limit, distance[:, 0])  # -1: no hit
     seen, geoms = np.full(near.shape, limit), np.full(near.shape, -1)
     seen[near] = np.where(leaves.any(axis=-1), 0.0, np.minimum(ahead, limit))
     geoms[near] = met[:, 0]
@@ -92,7 +92,7 @@ def brightness(scene: RayScene, shades: infrared.Reflectance, geom: np.ndarray) 
     Returns:
       [A, R, K] reflectance; 1 where a ray meets nothing.
     """
-    model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # the last: nothing
+    model, table = scene.model, np.ones((len(geom), scene.model.ngeom + 1))  # last column: no hit
     obstacles = scene.ids.obstacle_geom
     if shades.fixture is not None:
         table[:, scene.ids.fixture_geom[len(obstacles) :]] = shades.fixture[:, :1]

@@ -2,8 +2,8 @@
 
 Evaluation, benchmarks and studies compute their reported numbers here, after Agarwal et al. 2021,
 "Deep Reinforcement Learning at the Edge of the Statistical Precipice": interquartile means (section
-4.3) with percentile intervals of a bootstrap (section 4.1). Values are [runs, tasks]. A run is a
-training seed, and a task is a level or a stage on which the run's policy was judged.
+4.3) with percentile intervals of a bootstrap (section 4.1). Values have shape [runs, tasks]. A
+run is a training seed, and a task is a level or a stage on which the run's policy was evaluated.
 
 A bootstrap draws with replacement the part of the data to which its interval generalises, and keeps
 the rest fixed. Which part to draw depends on how the values were produced:
@@ -11,7 +11,7 @@ the rest fixed. Which part to draw depends on how the values were produced:
 =================  ==========================================  ==================================
 draw               each resample                               the interval is about
 =================  ==========================================  ==================================
-`runs`             draws runs with all their tasks             other runs, each judged on all
+`runs`             draws runs with all their tasks             other runs, each tested on all
                                                                these tasks
 `tasks`            draws tasks with all their runs             these runs, all on the same other
                                                                tasks
@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike
 BLOCK = 2**20  # values resampled at once: 8 MiB, and a few times as much for their indices
 # With two runs, half of all resamples hold one run twice, so the interval would span both runs.
 LEAST_DRAWN = 3
-CONFIDENCE = 0.95  # of every interval
+CONFIDENCE = 0.95  # level of every interval
 RESAMPLES = 2000
 
 type Draw = Literal["runs", "tasks", "runs_and_tasks"]

@@ -13,7 +13,7 @@ from swarmjax.task import stage_files
 from swarmjax.task.stage_config import StageConfig, complete
 
 # Seeds of a suite's levels begin here. People and benchmarks choose small seeds, so they draw other
-# levels. Training uses another generator altogether, JAX's.
+# levels. Training uses another generator, JAX's.
 SUITE_SEED = 1_000_000
 
 
@@ -48,7 +48,7 @@ class CellConfig(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteFileConfig(Section):
-    """A suite: levels for judging policies, never for training."""
+    """A suite: levels to evaluate policies on, never to train on."""
 
     name: str = field(metadata=about("name of the suite, equal to the name of its file"))
     cells: tuple[CellConfig, ...]

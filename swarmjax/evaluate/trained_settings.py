@@ -20,7 +20,7 @@ from swarmjax.sim.realism_config import RealismConfig
 from swarmjax.task import stage_files
 from swarmjax.task.config import TaskConfig, describe
 
-# Keys of the task that a judge needs too; rewards and step limit matter only in training.
+# Keys of the task that an evaluation needs too; rewards and step limit matter only in training.
 _TASK = ("control_step", "target_radius", "goal", "target_speed", "arrival", "observations")
 # Keys of the robot that a policy file holds in `meta.sensors`.
 _SENSORS = {

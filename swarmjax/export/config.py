@@ -19,14 +19,14 @@ class ExportConfig(Section):
         "npz", "form of the export; npz and onnx are one file, c and webots a folder"
     )
     step: int | None = setting(
-        None, "update of the run's checkpoint; null: the newest valid checkpoint", 0, MAX_COUNT
+        None, "update at which the checkpoint was saved; null: the newest valid one", 0, MAX_COUNT
     )
     seed: int | None = setting(None, "seed of the run's policy; null: all seeds", 0, MAX_COUNT)
     out: str | None = setting(
         None, "file or folder to write; null: named by format and step, in run or beside policy"
     )
     extensions: str | None = setting(
-        None, "Python file with the pieces that the policy needs; this file is executed"
+        None, "Python file with the extension that the policy needs; it is executed"
     )
 
     def _check(self) -> None:

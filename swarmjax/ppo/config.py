@@ -42,21 +42,21 @@ class AlgoConfig(Section):
     memory_size: int = setting(64, "size of the memory of each network [memory=gru]", 1, 1024)
     critic: Literal["observation", "state"] = setting(
         "observation",
-        "what the critic sees; state: also targets, other robots, walls, the distance to go "
-        "and the direction of the path, none of which the policy sees",
+        "what the critic sees; observation: the same as the policy; state: also where targets, "
+        "robots and walls are, and length and direction of the path to the target",
     )
     activation: Literal["tanh", "relu", "swish"] = setting(
         "tanh", "activation of the hidden layers"
     )
     mean_activation: Literal["linear", "tanh"] = setting(
         "linear",
-        "activation of the mean action; tanh: keeps the action within the range of the commands",
+        "activation of the mean action; tanh: keeps it within the range of the commands",
     )
     initialization: Literal["orthogonal", "uniform"] = setting(
         "orthogonal", "initial weights; uniform: weights and biases up to +-1 / sqrt(inputs)"
     )
     normalize_observations: bool = setting(
-        True, "normalise observations by running mean and deviation; false: raw; both clip to +-10"
+        True, "normalise observations by running mean and deviation; clipped to +-10 in any case"
     )
     rollout_length: int = setting(32, "control steps of each arena per update", 1, MAX_COUNT)
     epochs: int = setting(1, "passes over each rollout: 'PPO K epochs'", 1, MAX_COUNT)
@@ -66,8 +66,8 @@ class AlgoConfig(Section):
     )
     advantage: Literal["gae", "monte_carlo"] = setting(
         "gae",
-        "gae: bootstrapped, also at the step limit; monte_carlo: the critic and the advantages "
-        "use normalised returns up to the end of the episode or rollout",
+        "gae: bootstraps, also at the step limit; monte_carlo: critic and advantages use "
+        "normalised returns up to the end of the episode or rollout",
     )
     gae_lambda: float = setting(0.95, "GAE's lambda [advantage=gae]", 0.0, 1.0)
     clip_epsilon: float = setting(
@@ -99,8 +99,8 @@ class AlgoConfig(Section):
     entropy_cost: float = setting(0.0, "weight of the entropy bonus", 0.0)
     update_backend: Literal["auto", "autodiff"] = setting(
         "auto",
-        "how to compute gradients; auto: by GPU kernels if these support the GPU and the layers; "
-        "with a memory, by autodiff that leaves out the rollouts of absent robots",
+        "how to compute gradients; auto: GPU kernels if they support the GPU and the layers; with "
+        "a memory, autodiff without the rollouts of absent robots",
     )
     exploration: Literal["learned", "scheduled"] = setting(
         "learned", "standard deviation of the action: learned, or falling in steps by a schedule"
@@ -153,7 +153,7 @@ def resolve(config: AlgoConfig, networks: Sequence[Network]) -> str:
     """Returns the name of the network that a config selects.
 
     Args:
-      config: Names a network, or leaves the choice to the extension.
+      config: Settings; `network` names a network, or is None.
       networks: Networks of an extension.
 
     Raises:

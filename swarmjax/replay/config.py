@@ -16,7 +16,7 @@ class ReplayConfig(JudgeConfig):
 
     policy: str = field(metadata=about("path of a policy.npz; to compare two, a.npz,b.npz"))
     level: str | None = setting(
-        None, "numbers of the levels, as in 0,7,12; null: 0, unless worst is given"
+        None, "numbers of the levels to replay, as in 0,7,12; null: 0, unless worst is given"
     )
     worst: int | None = setting(None, "replay this many of the worst episodes", 1, 100)
     out: str = setting("replay.html", "HTML file of the replay")

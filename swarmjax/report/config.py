@@ -15,9 +15,9 @@ class ReportConfig(Section):
     run: str | None = setting(None, "run directory")
     runs: str | None = setting(
         None,
-        "give it instead of run: run directories or folders of runs (an array, a sweep), "
-        "separated by commas; prints a table with one line per group of runs with the same "
-        "settings, and draws the success of all groups into one figure",
+        "instead of run: run directories, or folders of runs (an array, a sweep), separated by "
+        "commas; runs with the same settings form a group; prints a table with a line per group, "
+        "and plots the success of all groups in one figure",
     )
     out: str | None = setting(
         None, "directory to write; null: report, in run or beside the first of runs"

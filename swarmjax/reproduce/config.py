@@ -34,7 +34,7 @@ class ReproduceConfig(Section):
     fine_tune: int = setting(FINE_TUNE, "as budget, for the arms NAME_expanded", UPDATE, _MOST)
     arms: tuple[Arm, ...] = setting(ARMS, "arms to train; NAME_expanded continues arm NAME")
     minutes: float | None = setting(
-        None, "save and stop after so many minutes; resume=DIR continues", above=0.0
+        None, "save and stop after this many minutes; resume=DIR continues", above=0.0
     )
     out: str | None = setting(None, "directory to write; null: runs/<date>-<time>-reproduce")
     resume: str | None = setting(None, "directory of the reproduction to continue")

@@ -128,8 +128,8 @@ class RobotConfig(Section):
     def wheel_inertia(self) -> list[float]:
         """Moments of inertia of a wheel, kg m^2: those of the e-puck's wheel, scaled by the mass.
 
-        The values do not depend on the radius. About the axle, the motor's inertia is far larger
-        than the wheel's. About the upright axis, the body makes up the rest of `yaw_inertia`.
+        The values do not depend on the wheel's radius. About the axle, the motor's inertia is far
+        larger than the wheel's. About the upright axis, the body adds the rest of `yaw_inertia`.
         """
         return [self.wheel_mass / epuck.WHEEL_MASS * part for part in epuck.WHEEL_INERTIA]
 

@@ -14,11 +14,10 @@ from swarmjax.sim.config import (
     MOST_FRICTION,
 )
 
-_LONGEST = 3600.0  # s; far more than is useful, since a training episode takes 16 s
+_LONGEST = 3600.0  # s; a training episode takes 16 s
 _MOST_LATENCY = 1000  # control steps; real robots have 1 to 10
 _LATENCY_REASON = "every arena stores one command or observation for each control step of latency"
-# Settings that act on a sensor's counts. They have no meaning for `ideal` sensors, which report
-# metres.
+# Settings that act on sensor counts. `ideal` sensors report metres, so they have no such settings.
 COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot")
 
 
@@ -26,9 +25,9 @@ COUNTED = ("infrared_noise", "infrared_gain", "reflectance", "reflectance_robot"
 class RealismConfig(Section):
     """Settings of the sensor models, and of random differences between robots and between steps.
 
-    A pair of numbers is the range (low, high) of a uniform distribution. A setting that is null
-    switches off its own effect only. configs/realism/real.yaml holds the numbers of a real robot,
-    with their sources.
+    A pair of numbers is the range (low, high) of a uniform distribution. Null switches off the
+    effect of one setting. configs/realism/real.yaml holds the numbers of a real robot, with their
+    sources.
     """
 
     name: Literal["ideal", "webots", "real"] = setting(
@@ -48,7 +47,7 @@ class RealismConfig(Section):
     )
     infrared_period: tuple[float, float] | None = setting(
         None,
-        "time between samples, s; per robot and episode; null: every control step",
+        "time between infrared samples, s; drawn per robot and episode; null: every control step",
         above=0.0,
         high=_LONGEST,
     )
@@ -59,46 +58,46 @@ class RealismConfig(Section):
         high=1.0,
     )
     reflectance_robot: tuple[float, float] | None = setting(
-        None, "reflectance of each robot; per episode; null: 1", above=0.0, high=1.0
+        None, "reflectance of each robot; drawn per episode; null: 1", above=0.0, high=1.0
     )
     dead_sensor: float | None = setting(
-        None, "probability of a dead sensor; per sensor and episode", 0.0, 1.0
+        None, "probability that a sensor detects nothing; drawn per sensor and episode", 0.0, 1.0
     )
     wheel_radius: tuple[float, float] | None = setting(
-        None, "radius of the wheels, m; per robot and episode", LEAST, below=0.03
+        None, "radius of the wheels, m; drawn per robot and episode", LEAST, below=0.03
     )
     track: tuple[float, float] | None = setting(
         None, "as robot.effective_track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
     )
     max_wheel_speed: tuple[float, float] | None = setting(
-        None, "speed limit of each wheel, rad/s; per robot and episode", LEAST, FASTEST_WHEEL
+        None, "speed limit of each wheel, rad/s; drawn per robot and episode", LEAST, FASTEST_WHEEL
     )
     mass: tuple[float, float] | None = setting(
-        None, "mass, kg; per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0
+        None, "mass, kg; drawn per robot and episode", above=2 * epuck.WHEEL_MASS, high=100.0
     )
     friction: tuple[float, float] | None = setting(
         None,
-        "friction of wheels on floor; per robot and episode",
+        "friction of wheels on floor; drawn per robot and episode",
         LEAST,
         MOST_FRICTION,
         reason=FRICTION_REASON,
     )
     speed_noise: float | None = setting(
-        None, "relative SD of the wheel speed; per wheel and control step", 0.0, 1.0
+        None, "relative SD of the wheel speed; drawn per wheel and control step", 0.0, 1.0
     )
     speed_quantisation: Literal["epuck1", "epuck2"] | None = setting(
-        None, "rounds wheel speeds to those that this firmware can set"
+        None, "round wheel speeds to those that this robot's firmware can set"
     )
     action_latency: tuple[int, int] | None = setting(
         None,
-        "latency of commands, control steps; per robot and episode",
+        "latency of commands, control steps; drawn per robot and episode",
         0,
         _MOST_LATENCY,
         reason=_LATENCY_REASON,
     )
     observation_latency: tuple[int, int] | None = setting(
         None,
-        "latency of observations, control steps; per robot and episode",
+        "latency of observations, control steps; drawn per robot and episode",
         0,
         _MOST_LATENCY,
         reason=_LATENCY_REASON,

@@ -29,19 +29,19 @@ def _weight(default: float, meaning: str) -> Any:
 class RewardConfig(Section):
     """Weights of the reward terms: equation 3 of the paper, and penalties."""
 
-    progress: float = _weight(1.0, "per metre nearer to the target")
+    progress: float = _weight(1.0, "per metre that the robot comes nearer to its target")
     path_progress: float = _weight(
-        0.0, "per metre nearer along the shortest path around walls and boxes"
+        0.0, "per metre by which the shortest path around walls and boxes gets shorter"
     )
     proximity: float = _weight(
-        0.0, "per control step before arrival with an object in infrared range"
+        0.0, "per control step before arrival in which an object is in infrared range"
     )
     arrival: float = _weight(
         0.0,
         "once, on arrival; arrival=hold or goal=gather: when all robots have arrived; "
         "goal=lifelong: at each target; goal=cover: in each step in which the robot sees new floor",
     )
-    contact: float = _weight(-0.2, "per contact event of any kind")
+    contact: float = _weight(-0.2, "per contact that begins, of any kind")
     touching: float = _weight(0.0, "per control step in which the robot touches something")
     step_penalty: float = _weight(-0.002, "per control step that begins before arrival")
     extra: dict[str, float] = field(
@@ -124,7 +124,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
       steps: number of control steps in an episode.
 
     Raises:
-      ConfigError: a setting is too large; the message names the full key.
+      ConfigError: a setting contradicts them; the message names the full key.
     """
     if realism.infrared == "real" and robot.sensor_poses != epuck.SENSOR_POSES:
         raise ConfigError(
@@ -157,8 +157,7 @@ def check_realism(realism: RealismConfig, robot: RobotConfig, task: TaskConfig, 
 def resolve_encoding(task: TaskConfig, realism: RealismConfig) -> Literal["metric", "webots"]:
     """Returns the encoding of observations.
 
-    `metric` observes metres and radians. `webots` observes counts / 1023, distance / 1.5 m and
-    (bearing + pi) / (2 pi), as in deepworlds' find_and_avoid.
+    `metric` observes metres and radians. `INPUTS` of observation.py has the scales of `webots`.
     """
     if task.encoding != "auto":
         return task.encoding

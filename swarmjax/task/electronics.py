@@ -31,13 +31,13 @@ _SLACK = 1e-4  # share of a period; with it, rounding does not delay a sample th
 
 @dataclass(frozen=True, kw_only=True)
 class Electronics:
-    """Settings of the electronics, fixed for all episodes of a program.
+    """Settings of the electronics, fixed in a compiled program.
 
     Attributes:
       realism: which factors are on.
       encoding: how observations are encoded.
-      robot: the robot; its sensors are read.
-      control_step: s.
+      robot: the robot, for its sensors.
+      control_step: length of a control step, s.
       own: observations of an extension, placed after the built-in ones.
     """
 
@@ -108,7 +108,7 @@ def view(sight: Sight, pose: Array, level: Level, arrived: Array, clock: Array) 
       clock: [...] or [] control steps since the start.
 
     Returns:
-      The view of one arena or of many.
+      The view of one arena, or of many.
     """
     return View(
         pose=pose,
@@ -280,7 +280,7 @@ def _read(
 
 def _is_due(clock: Array, period: Array, control_step: float, xp: Any) -> Array:
     """Returns [..., R] whether a sample was due in the control step that has just ended."""
-    clock = xp.asarray(clock, xp.float32)  # so that NumPy and JAX round alike, and sample alike
+    clock = xp.asarray(clock, xp.float32)  # so that NumPy and JAX round alike
     ended = clock[..., None] * control_step / period + _SLACK
     return xp.floor(ended) > xp.floor(ended - control_step / period)
 
@@ -325,7 +325,7 @@ def _read_counts(
 def _find_target(
     realism: RealismConfig, factors: Factors, sight: Sight, clock: Array, xp: Any
 ) -> tuple[Array, Array]:
-    """Returns distance and bearing [..., R] of the targets, as an overhead camera sees them."""
+    """Returns distance and bearing [..., R] of the targets, with noise as of a camera."""
     distance, bearing = sight.distance, sight.bearing
     robots = distance.shape[-1:]
     if realism.target_distance_noise is not None:

@@ -318,7 +318,7 @@ def _look_by_extension(
 def _tally(
     episode: Episode, gained: Array, begins: Array, earned: reward.Step, counted: Array
 ) -> Episode:
-    """Adds a step to the episode's sums, for the `counted` robots [R] only."""
+    """Adds a step to the sums; for `sensed` and `moving`, only `counted` robots [R] count."""
     sensed = counted & (reward.proximity(earned) > 0.0)
     return Episode(
         reward=episode.reward + gained,

@@ -44,7 +44,7 @@ class Robots(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Finished episodes, [T, A, ...]; zero where no episode ended.
+    """Finished episodes by control step and arena, [T, A, ...]; zero where no episode ended.
 
     Attributes:
       episodes: 1 where an episode ended.
@@ -55,7 +55,7 @@ class Ended(NamedTuple):
       all_reached: 1 where every robot had arrived.
       steps: control steps of the episode.
       robot_steps: control steps before arrival, summed over robots.
-      sensed: control steps in which a ray was shorter than the infrared range.
+      sensed: control steps in which a ray was shorter than the infrared range, summed over robots.
       contacts: [.., 3] contacts of each kind, summed over robots.
       reward: undiscounted sum of rewards, summed over robots.
       broken: 1 where the episode ended because `TimeStep.sound` was false.

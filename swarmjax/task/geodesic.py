@@ -1,10 +1,10 @@
 """Distance to the target along the shortest path around walls and boxes.
 
 A visibility graph (Lozano-Pérez & Wesley 1979, "An Algorithm for Planning Collision-Free Paths
-Among Polyhedral Obstacles") is solved once per episode for every target. For each corner that a
-robot can see, the distance to the corner and the distance from there to the target are then added.
-The smallest of these sums is the robot's distance. Navigation rewards count progress along this
-path (Wijmans et al. 2020, "DD-PPO", section 4).
+Among Polyhedral Obstacles") is solved once per episode for every target. A
+robot's path is then the straight line, if it is free, or the shortest path through a corner that
+the robot can see. Navigation rewards count progress along this path (Wijmans et al. 2020,
+"DD-PPO", section 4).
 
 Other robots are ignored. Obstacles are widened by a little less than a robot's radius, with square
 corners, so a robot that touches one is still outside the wider shape. Paths are therefore between a
@@ -214,8 +214,8 @@ def _frames(level: Level) -> Array:
 def _locate(place: Array, level: Level) -> _Places:
     """Turns places [P, 2] into coordinates in the frames of the obstacles."""
     local = into_frame(level.obstacle[:, None, :3], place)
-    # Each pair of places uses these coordinates. Without the barrier, XLA inlines their computation
-    # into the code of every pair, and compiling takes minutes on a GPU.
+    # Without the barrier, XLA inlines this computation into the code of every pair of places, and
+    # compiling takes minutes on a GPU.
     return _Places(place, *jax.lax.optimization_barrier(local))
 
 

@@ -94,7 +94,7 @@ class _Uniforms(NamedTuple):
 
 
 def uniform_count(spacing: Spacing) -> int:
-    """Returns how many uniform numbers a level takes."""
+    """Returns how many uniform numbers a level is drawn from."""
     return 8 + 2 * spacing.obstacles + 3 * spacing.robots
 
 
@@ -190,7 +190,7 @@ def _seed(drawn: _Uniforms, xp: Any) -> Array:
 def _side(stage: Stage, seed: Array, xp: Any) -> Array:
     """Draws the side of the arena, m, in whole units, if the stage gives a range.
 
-    The side is a hash of the level's seed, so nothing else in the level depends on it.
+    The side is drawn from a hash of the level's seed, so it changes no other random number.
     """
     low = xp.ceil(stage.side * UNITS).astype(xp.int32)
     count = xp.floor(stage.largest_side * UNITS).astype(xp.int32) - low + 1

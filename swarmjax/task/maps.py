@@ -50,7 +50,7 @@ class Map(NamedTuple):
 
 
 class MapArrays(NamedTuple):
-    """The maps of stages as arrays, [S, ...] or [...]; missing points are marked as not open.
+    """The maps of stages as arrays, [S, ...] or [...]; points that only pad are not `open`.
 
     Attributes:
       mapped: whether the stage has a map, bool.
@@ -81,7 +81,7 @@ def read(rows: Sequence[str], cell: float) -> Map:
       cell: edge of a cell, m.
 
     Returns:
-      The map; if it is not square, walls are added on both sides.
+      The map. If it is not square, walls on two sides make it square.
 
     Raises:
       ConfigError: the text is invalid; the message says why.

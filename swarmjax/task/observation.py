@@ -185,7 +185,7 @@ def observe(readings: Readings, layout: Layout, xp: Any) -> Array:
 
 
 class View(NamedTuple):
-    """Exact, noise-free state of one arena, the input of an extension's observations.
+    """Exact state of one arena, the input of an extension's observations.
 
     Attributes:
       pose: [R, 3] x (m), y (m), yaw (rad).

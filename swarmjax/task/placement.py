@@ -1,8 +1,8 @@
 """Places objects one after the other on the points of a lattice, in integers.
 
 With integer arithmetic, NumPy and JAX choose the same point from the same uniform number. The unit
-is 1/4096 m. This is a power of two, so lengths convert to metres exactly. The unit is large enough
-that squared distances within the largest arena fit an int32.
+is 1/4096 m, a power of two, so lengths convert to metres exactly. It is large enough that squared
+distances within the largest arena fit an int32.
 """
 
 import math
@@ -151,7 +151,7 @@ def score_things(points: Array, centres: Array, there: Array, gap: Gap, xp: Any)
 
 
 def score_open(points: Array, is_open: Array, xp: Any) -> Array:
-    """Scores points by whether they may be used.
+    """Scores points by whether they are open for placement.
 
     Args:
       points: [P, 2] units.
@@ -159,7 +159,7 @@ def score_open(points: Array, is_open: Array, xp: Any) -> Array:
       xp: `numpy` or `jax.numpy`.
 
     Returns:
-      [P] 0 where a point is open, very low where it is not.
+      [P] 0 where a point is open, else very low.
     """
     return xp.where(is_open, 0, FORBIDDEN + 0 * points[:, 0])
 

@@ -25,7 +25,7 @@ class Step(NamedTuple):
       infrared: [R, K] ray lengths after the step, m.
       sensor_range: m.
       arrives: [R] whether the robot arrived in this step; with `task.arrival=hold`, whether all
-        robots are within their targets, which ends the episode.
+        robots are at their targets, which ends the episode.
       contact_begins: [R, 3] whether a contact of each kind began in this step.
       touching: [R, 3] whether the robot touches something of each kind after the step.
       outside: [R] whether the robot had not yet arrived when the step began.

@@ -82,11 +82,11 @@ def _levels(
 
 
 def check_level(stage: StageConfig, drawn: Level, spacing: Spacing) -> None:
-    """Refuses a level that has no room for its robots; without JAX."""
+    """Refuses a level that has no room for its robots."""
     arrived = np.linalg.norm(drawn.start[:, :2] - drawn.target, axis=-1) < spacing.target_radius
     problem = _problem(drawn, spacing, gaps.KINDS, gaps.KINDS)
     if not problem and (arrived & drawn.present).any():
-        problem = "a robot starts within its target"
+        problem = "a robot starts at its target"
     if problem:
         raise ConfigError(
             f"stage {stage.name}: level={stage.level} has no room for {stage.robots} robots, "

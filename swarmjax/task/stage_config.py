@@ -91,7 +91,7 @@ class StageConfig(Section):
     )
     level: str = setting(
         "random",
-        "random: new in every episode; fixed: always the same; map: the walls of map, with "
+        "random: new in every episode; fixed: always the same; map: walls from the key map, with "
         f"new starts and targets; {', '.join(LAYOUTS)}: new walls of this layout; or the name "
         "of an extension's level drawing",
     )
@@ -194,7 +194,7 @@ class StageConfig(Section):
             )
 
     def _check_keys(self, layout: ArenaLayout | None) -> None:
-        """Refuses sizes that the level does not have, and asks for those that it needs."""
+        """Refuses sizes that the level does not use, and asks for those that it needs."""
         needed = () if layout is None else layout.reads
         optional = () if layout is None or layout.square else ("breadth",)
         for key in (*NUMBERS, "breadth", "cells"):

@@ -63,7 +63,7 @@ def read_stage(choice: str, key: str = "stage") -> dict[str, Any]:
 def load_levels[C: Section](
     cls: type[C], overrides: Sequence[str], stage: dict[str, Any] | None = None
 ) -> C:
-    """Creates the settings of a command that plays the levels of one stage or of a suite.
+    """Creates the settings of a command that runs levels of one stage or of a suite.
 
     Args:
       cls: the command's dataclass, with `stage` and `suite`.

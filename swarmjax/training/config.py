@@ -38,8 +38,8 @@ class ProgramConfig(Section):
     )
     seeds_by: Literal["vmap", "cores", "devices"] = setting(
         "vmap",
-        "how to train the seeds; vmap: all seeds side by side; cores: in one group for each core "
-        "of a CPU; devices: in one group for each device; the seeds of a group run side by side",
+        "how to train the seeds; vmap: all side by side; cores: split over the cores of a CPU; "
+        "devices: split over the devices",
     )
     arenas: int = setting(128, "arenas simulated at once", 1, 2**20)
     devices: int = setting(
@@ -105,5 +105,5 @@ class ProgramConfig(Section):
 
     @property
     def waiting(self) -> int:
-        """Number of episodes that are drawn for each arena before a rollout."""
+        """Number of levels that are drawn for each arena before a rollout."""
         return self.levels_per_rollout or max(1, self.algo.rollout_length // STEPS_PER_EPISODE)

@@ -342,11 +342,11 @@ def test_help_gives_range_unit_and_choices(cls, command, robot, realism, mass):
     )
     lines = [" ".join(line.split()) for line in help_text(cls, command, ["realism"]).splitlines()]
     assert (
-        f"realism.mass={mass} mass, kg; per robot and episode "
+        f"realism.mass={mass} mass, kg; drawn per robot and episode "
         "(a range [low,high] of numbers more than 0.01, at most 100 or null)" in lines
     )
     assert (
-        f"realism.action_latency={mass} latency of commands, control steps; per robot and episode "
-        "(a range [low,high] of whole numbers 0 to 1000 or null)" in lines
+        f"realism.action_latency={mass} latency of commands, control steps; drawn per robot and "
+        "episode (a range [low,high] of whole numbers 0 to 1000 or null)" in lines
     )
     assert not any(line.startswith("realism.name") for line in lines)

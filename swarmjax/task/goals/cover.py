@@ -33,7 +33,7 @@ class Floor(NamedTuple):
 
 
 class Cover(Goal):
-    """The target of a robot is the nearest cell of floor that no robot has seen."""
+    """All robots together see the floor."""
 
     measures: Mapping[str, Measure] = {"floor_seen": Measure("floor seen", "%", is_good=True)}
 

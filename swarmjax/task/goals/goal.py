@@ -76,9 +76,9 @@ class Goal:
     """A goal. This base class never changes the targets, and ends once all robots are at theirs.
 
     Attributes:
-      ends: what ends before the time is out. `each`: a robot that arrives stops for good, and
-        the episode is over when all have. `all`: the episode is over when all robots have arrived
-        in the same control step. `never`: nothing ends.
+      ends: what ends an episode before the time is out. `each`: a robot that arrives stops for
+        good, and the episode is over when all have. `all`: the episode is over when all robots have
+        arrived in the same control step. `never`: nothing.
       moves: whether targets may change within an episode.
       measures: the goal's own measures, by name.
       sizes: settings that the goal may use.
@@ -99,7 +99,7 @@ class Goal:
         """Returns the goal's answer to a control step.
 
         Args:
-          state: from `begin` or from the turn before.
+          state: from `begin` or from the previous turn.
           level: the level, with the targets of this step.
           view: the arena after the step, except `view.arrived`, which is from before the step.
         """
@@ -118,7 +118,7 @@ class Goal:
         return view.distance <= self.sizes.target_radius
 
     def drives(self, arrived: Array) -> Array:
-        """Returns which robots [..., R] obey their commands, after some have arrived."""
+        """Returns which robots [..., R] obey their commands, given which have arrived."""
         return ~arrived if self.ends == "each" else ~arrived | True
 
     def is_under_way(self, arrived: Array) -> Array:

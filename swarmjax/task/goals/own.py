@@ -1,4 +1,4 @@
-"""Goals of an extension: their checks, and how the judge runs them."""
+"""Checks goals of an extension, and adapts them to the judge."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -100,7 +100,7 @@ def _check_shapes(name: str, first: Any, turn: Turn, robots: int) -> None:
 
 
 def _check_state(name: str, before: Any, after: Any) -> None:
-    """Refuses a state that changes its shapes, or is no array or tuple of arrays."""
+    """Refuses a state that changes its shapes, or is neither an array nor a tuple of arrays."""
     if not _is_plain(before):
         raise ConfigError(
             f"{name} has a {type(before).__name__} as state: return an array or a tuple of arrays."

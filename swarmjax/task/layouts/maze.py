@@ -27,7 +27,7 @@ def edges(cells: int) -> np.ndarray:
       cells: number of cells along a side.
 
     Returns:
-      [E, 2] indices of cells, which count row by row from below. Pairs along x come first.
+      [E, 2] indices of cells, which are numbered row by row from below. Pairs along x come first.
     """
     number = np.arange(cells * cells).reshape(cells, cells)
     along = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=-1)
@@ -102,7 +102,7 @@ def _tree(pairs: np.ndarray, order: Array, xp: Any) -> Array:
 def _braid(pairs: np.ndarray, open_: Array, order: Array, cells: int, xp: Any) -> Array:
     """Opens one more edge [E] of each cell that has only one open edge.
 
-    An edge that leads to another such cell is preferred, so that most walls remain.
+    If possible, it leads to another such cell, so that most walls remain.
     """
     ends = np.arange(cells * cells)[:, None, None] == pairs  # [C, E, 2]
     touches = xp.asarray(ends.any(axis=-1))

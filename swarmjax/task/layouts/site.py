@@ -32,7 +32,7 @@ class Numbers(NamedTuple):
     apart: Array
 
 
-NUMBERS = Numbers._fields  # settings of a stage, m
+NUMBERS = Numbers._fields  # names of a stage's settings, m
 
 
 class Site(NamedTuple):
@@ -40,7 +40,7 @@ class Site(NamedTuple):
 
     Attributes:
       half: [2] half of the arena's extent along x and y.
-      numbers: numbers of this level.
+      numbers: lengths of this level.
       cells: number of cells along a side of a maze, or of boxes on plots; 0 for other layouts.
       present: [R] whether the robot is present.
       hull: radius of the robots.
@@ -80,8 +80,8 @@ class ArenaLayout(NamedTuple):
 
     Attributes:
       draw: draws the layout from uniform numbers [K] in [0, 1), a site and the array module.
-      uniforms: takes a number of robots and cells, and returns how many uniform numbers the layout
-        takes.
+      uniforms: takes the numbers of robots and cells, and returns how many uniform numbers `draw`
+        needs.
       walls: takes the number of cells of a site, and returns the largest number of walls.
       reads: names of the `NUMBERS` that the layout uses, or `cells`.
       most_robots: largest number of robots, however large the arena.
