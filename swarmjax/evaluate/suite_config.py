@@ -41,8 +41,8 @@ class CellConfig(Section):
             raise ConfigError(f"name is {show(self.name)}: give letters, digits, _ and - only.")
         if self.episodes and len(self.episodes) != self.levels:
             raise ConfigError(
-                f"levels is {self.levels}, but episodes lists {len(self.episodes)}: give as many "
-                "episodes as levels."
+                f"levels is {self.levels}, but episodes has {len(self.episodes)} entries: list one "
+                "episode for each level."
             )
 
 

@@ -47,7 +47,7 @@ class ReplayConfig(JudgeConfig):
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """The numbers of the levels that `level` lists; 0 if it is None."""
+        """Indices of the levels that `level` lists; index 0 if it is None."""
         return (0,) if self.level is None else tuple(int(each) for each in self.level.split(","))
 
     @property

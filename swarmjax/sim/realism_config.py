@@ -67,7 +67,10 @@ class RealismConfig(Section):
         None, "radius of the wheels, m; drawn per robot and episode", LEAST, below=0.03
     )
     track: tuple[float, float] | None = setting(
-        None, "as robot.effective_track, m; per robot and episode", LEAST, 2 * LARGEST_HULL
+        None,
+        "replaces robot.effective_track, m; drawn per robot and episode",
+        LEAST,
+        2 * LARGEST_HULL,
     )
     max_wheel_speed: tuple[float, float] | None = setting(
         None, "speed limit of each wheel, rad/s; drawn per robot and episode", LEAST, FASTEST_WHEEL
