@@ -50,7 +50,7 @@ class Judge:
       ids: Rows of the model's moving bodies.
       scene: The scene for infrared rays.
       geom_robot: For each geom, the index of the robot whose contact geom it is, else -1.
-      geom_kind: For each geom, the index in `gaps.KINDS` of a contact with it.
+      geom_kind: For each geom, the kind of a contact with it, as an index into `gaps.KINDS`.
       substeps: Physics steps of a control step.
       own: Function that computes the extension's observations [A, R, E] from a view [A]; None if
         there are none.

@@ -49,7 +49,7 @@ class Problem:
       J: [A, 1, E] entries of the sparse Jacobians. A row has `J_count` entries from index `J_first`
         on, from the last joint to the first.
       J_first: [A, N] index of a row's first entry.
-      J_count: [A, N] number of a row's entries.
+      J_count: [A, N] how many entries a row has.
       J_column: [A, 1, E] joint to which an entry belongs.
       D: [A, N] weight of a row.
       aref: [A, N] acceleration that a row demands.
