@@ -24,29 +24,28 @@ _CONJUGATE = wp.constant(64)  # limit of steps of conjugate gradients
 _CLOSE = wp.constant(1e-8)
 
 
-@wp.func_native("""
+def _across_threads(join: str) -> str:
+    """Returns CUDA code that joins `value` with the `other` value of each thread of the arena."""
+    return f"""
 #if defined(__CUDA_ARCH__)
     unsigned mask = 0xffffffffu >> (32 - threads) << (threadIdx.x % 32 / threads * threads);
     __syncwarp(mask);
-    for (int away = threads / 2; away > 0; away /= 2)
-        value += __shfl_xor_sync(mask, value, away);
+    for (int away = threads / 2; away > 0; away /= 2) {{
+        float other = __shfl_xor_sync(mask, value, away);
+        value = {join};
+    }}
 #endif
     return value;
-""")
+"""
+
+
+@wp.func_native(_across_threads("value + other"))
 def _sum(value: float, threads: int) -> float:
     """Waits until all threads of the arena have written their results; adds up their values."""
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    unsigned mask = 0xffffffffu >> (32 - threads) << (threadIdx.x % 32 / threads * threads);
-    __syncwarp(mask);
-    for (int away = threads / 2; away > 0; away /= 2)
-        value = fmaxf(value, __shfl_xor_sync(mask, value, away));
-#endif
-    return value;
-""")
+@wp.func_native(_across_threads("fmaxf(value, other)"))
 def _largest(value: float, threads: int) -> float:
     """Waits as `_sum` does; returns the largest value of the arena's threads."""
     ...
@@ -95,17 +94,17 @@ def _begin(problem: Problem, together: Together, arena: int, thread: int, thread
     """Begins conjugate gradients for Newton's step; returns the squared residual."""
     total = wp.float32(0.0)
     for robot in range(thread, problem.own.shape[1], threads):
-        wheeled.put_robot(together.step, arena, robot, Vector())
         if problem.touches[arena, robot]:
-            lane = arena * problem.own.shape[1] + robot
+            wheeled.put_robot(together.step, arena, robot, Vector())
+            index = wheeled.index_of(problem, arena, robot)
             hessian = wheeled.inertia_of(problem, arena, robot)
             now = wheeled.of_robot(problem.qacc, arena, robot)
             downhill = wheeled.of_robot(problem.force, arena, robot) - wheeled.times(hessian, now)
             for k in range(problem.own[arena, robot]):
-                row = wheeled.scaled(problem, k, lane)
+                row = wheeled.scaled(problem, k, index)
                 gap = wp.dot(row, now) + _far(problem, arena, robot, k, problem.qacc)
-                gap -= problem.scaled[k, wheeled.AREF, lane]
-                problem.scaled[k, wheeled.GAP, lane] = gap
+                gap -= problem.scaled[k, wheeled.AREF, index]
+                problem.scaled[k, wheeled.GAP, index] = gap
                 if gap < 0.0:
                     downhill = downhill - gap * row
                     if problem.row[arena, robot, k][2] != wheeled.SHARED:
@@ -156,11 +155,11 @@ def _conjugate(
 @wp.func
 def _bend(problem: Problem, together: Together, arena: int, robot: int, way: Vector) -> Vector:
     """Multiplies the Hessian by the present direction; returns the robot's eight values."""
-    lane = arena * problem.own.shape[1] + robot
+    index = wheeled.index_of(problem, arena, robot)
     bend = wheeled.times(wheeled.inertia_of(problem, arena, robot), way)
     for k in range(problem.own[arena, robot]):
-        if problem.scaled[k, wheeled.GAP, lane] < 0.0:
-            row = wheeled.scaled(problem, k, lane)
+        if problem.scaled[k, wheeled.GAP, index] < 0.0:
+            row = wheeled.scaled(problem, k, index)
             along = wp.dot(row, way) + _far(problem, arena, robot, k, together.way)
             bend = bend + along * row
     return bend
@@ -172,13 +171,13 @@ def _take(problem: Problem, together: Together, arena: int, thread: int, threads
     switches = wp.float32(0.0)
     for robot in range(thread, problem.own.shape[1], threads):
         if problem.touches[arena, robot]:
-            lane = arena * problem.own.shape[1] + robot
+            index = wheeled.index_of(problem, arena, robot)
             step = wheeled.of_robot(together.step, arena, robot)
             for k in range(problem.own[arena, robot]):
-                slope = wp.dot(wheeled.scaled(problem, k, lane), step)
+                slope = wp.dot(wheeled.scaled(problem, k, index), step)
                 slope += _far(problem, arena, robot, k, together.step)
-                problem.scaled[k, wheeled.SLOPE, lane] = slope
-                if wheeled.does_switch(problem.scaled[k, wheeled.GAP, lane], slope):
+                problem.scaled[k, wheeled.SLOPE, index] = slope
+                if wheeled.does_switch(problem.scaled[k, wheeled.GAP, index], slope):
                     switches = wp.float32(1.0)
     switches = _largest(switches, threads)
     length = wp.float32(1.0)
@@ -229,6 +228,6 @@ def _tilt(problem: Problem, arena: int, thread: int, threads: int, length: float
             for k in range(problem.own[arena, robot]):
                 # Both robots of a shared row add it, so each adds half.
                 part = wp.where(problem.row[arena, robot, k][2] == wheeled.SHARED, 0.5, 1.0)
-                lane = arena * problem.own.shape[1] + robot
-                tilt = tilt + part * wheeled.tilt_of(problem, k, lane, length)
+                index = wheeled.index_of(problem, arena, robot)
+                tilt = tilt + part * wheeled.tilt_of(problem, k, index, length)
     return wp.vec2(_sum(tilt[0], threads), _sum(tilt[1], threads))

@@ -91,7 +91,7 @@ class Together:
     Attributes:
       crowded: [1] number of arenas in which robots touch each other.
       arena: [A] indices of these arenas; only the first `crowded` entries are used.
-      step: [A, V] Newton's step; 0 for robots that touch no other robot.
+      step: [A, V] Newton's step. Arrays [A, V] are set only for robots that touch another robot.
       rest: [A, V] what the step leaves of the cost's slope.
       way: [A, V] direction of the next step of conjugate gradients.
       bend: [A, V] the Hessian times `way`; then `rest` divided by the robots' blocks.
@@ -273,17 +273,23 @@ def narrow(search: wp.vec3, tilt: float, curve: float) -> wp.vec3:
 
 
 @wp.func
-def scaled(problem: Problem, k: int, lane: int) -> Vector:
+def index_of(problem: Problem, arena: int, robot: int) -> int:
+    """Returns a robot's index on the last axis of `Problem.scaled`."""
+    return arena * problem.own.shape[1] + robot
+
+
+@wp.func
+def scaled(problem: Problem, k: int, index: int) -> Vector:
     """Returns a robot's entries in one of its rows, times the square root of D."""
     found = Vector()
     for i in range(8):
-        found[i] = problem.scaled[k, i, lane]
+        found[i] = problem.scaled[k, i, index]
     return found
 
 
 @wp.func
-def tilt_of(problem: Problem, k: int, lane: int, length: float) -> wp.vec2:
+def tilt_of(problem: Problem, k: int, index: int, length: float) -> wp.vec2:
     """Returns the first and second derivative of the cost of a robot's row along a step."""
-    slope = problem.scaled[k, SLOPE, lane]
-    there = wp.min(0.0, problem.scaled[k, GAP, lane] + length * slope)
+    slope = problem.scaled[k, SLOPE, index]
+    there = wp.min(0.0, problem.scaled[k, GAP, index] + length * slope)
     return slope * wp.vec2(there, wp.where(there < 0.0, slope, 0.0))

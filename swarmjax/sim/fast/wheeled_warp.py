@@ -166,17 +166,17 @@ def _scale(problem: Problem, arena: int, robot: int, k: int) -> None:
     side = problem.row[arena, robot, k]
     root = wp.sqrt(problem.D[arena, side[0]])
     entries = root * wheeled.entries_of(problem, arena, side)
-    lane = arena * problem.own.shape[1] + robot
+    index = wheeled.index_of(problem, arena, robot)
     for i in range(8):
-        problem.scaled[k, i, lane] = entries[i]
-    problem.scaled[k, wheeled.AREF, lane] = root * problem.aref[arena, side[0]]
+        problem.scaled[k, i, index] = entries[i]
+    problem.scaled[k, wheeled.AREF, index] = root * problem.aref[arena, side[0]]
 
 
 @wp.kernel(enable_backward=False)
 def _relax_each(problem: Problem, iterations: int) -> None:
-    """Runs Newton's method for a robot that touches no other robot."""
+    """Copies a robot's rows, and runs Newton's method if the robot touches no other robot."""
     arena, robot = wp.tid()
-    lane, own = arena * problem.own.shape[1] + robot, problem.own[arena, robot]
+    index, own = wheeled.index_of(problem, arena, robot), problem.own[arena, robot]
     # Copy rows here and not in `_share_out`: there, neighbouring threads would copy one by one.
     for k in range(own):
         _scale(problem, arena, robot, k)
@@ -189,9 +189,9 @@ def _relax_each(problem: Problem, iterations: int) -> None:
         downhill = _newton(problem, arena, robot, now)
         moves = wp.bool(False)
         for k in range(own):
-            slope = wp.dot(wheeled.scaled(problem, k, lane), downhill)
-            problem.scaled[k, wheeled.SLOPE, lane] = slope
-            moves = moves or wheeled.does_switch(problem.scaled[k, wheeled.GAP, lane], slope)
+            slope = wp.dot(wheeled.scaled(problem, k, index), downhill)
+            problem.scaled[k, wheeled.SLOPE, index] = slope
+            moves = moves or wheeled.does_switch(problem.scaled[k, wheeled.GAP, index], slope)
         length = wp.float32(1.0)
         if moves:
             length = _length(problem, arena, robot, now, downhill)
@@ -204,13 +204,13 @@ def _relax_each(problem: Problem, iterations: int) -> None:
 @wp.func
 def _newton(problem: Problem, arena: int, robot: int, now: Vector) -> Vector:
     """Returns Newton's step for the rows that are active at the accelerations `now`."""
-    lane = arena * problem.own.shape[1] + robot
+    index = wheeled.index_of(problem, arena, robot)
     hessian = wheeled.inertia_of(problem, arena, robot)
     uphill = wheeled.times(hessian, now) - wheeled.of_robot(problem.force, arena, robot)
     for k in range(problem.own[arena, robot]):
-        row = wheeled.scaled(problem, k, lane)
-        gap = wp.dot(row, now) - problem.scaled[k, wheeled.AREF, lane]
-        problem.scaled[k, wheeled.GAP, lane] = gap
+        row = wheeled.scaled(problem, k, index)
+        gap = wp.dot(row, now) - problem.scaled[k, wheeled.AREF, index]
+        problem.scaled[k, wheeled.GAP, index] = gap
         if gap < 0.0:
             uphill = uphill + gap * row
             hessian = wheeled.add(hessian, row, row)
@@ -237,8 +237,8 @@ def _length(problem: Problem, arena: int, robot: int, now: Vector, downhill: Vec
 @wp.func
 def _tilt(problem: Problem, arena: int, robot: int, length: float) -> wp.vec2:
     """Returns the first and second derivative of the cost of a robot's rows along a step."""
-    lane = arena * problem.own.shape[1] + robot
+    index = wheeled.index_of(problem, arena, robot)
     tilt = wp.vec2()
     for k in range(problem.own[arena, robot]):
-        tilt = tilt + wheeled.tilt_of(problem, k, lane, length)
+        tilt = tilt + wheeled.tilt_of(problem, k, index, length)
     return tilt
