@@ -70,13 +70,14 @@ class CurriculumConfig(Section):
     shares: Literal["arenas", "robots"] = setting(
         "arenas",
         "what the stages' weights are shares of; robots: a stage with more robots gets fewer "
-        "arenas, so that its weight is its share of all robots [adaptive]",
+        "arenas, so that its weight is its share of all robots [mode=adaptive]",
     )
     optimizer: Literal["keep", "reset"] = setting(
         "keep", "Adam's moments after a promotion; reset: 0 [mode=sequential or mixed]"
     )
     exploration: Literal["keep", "reset"] = setting(
-        "keep", "SD of actions after a promotion; reset: algo.initial_std [sequential, mixed]"
+        "keep",
+        "SD of actions after a promotion; reset: algo.initial_std [mode=sequential or mixed]",
     )
 
     def _check(self) -> None:

@@ -29,7 +29,7 @@ class Outcome(NamedTuple):
       arrived: [A, R] whether the robot has arrived; with `task.arrival=hold`, whether it is
         at its target.
       arrival: [A, R] control steps until the robot arrived; 0 if it has not arrived. With `hold`,
-        control steps until it came to its target for the last time.
+        control steps until its last arrival at its target.
       contacts: [A, R, 3] contacts of each kind of `gaps.KINDS`, also after arrival.
       touched: [A, R, 3] control steps that ended with the robot in contact, also after arrival.
       sensed: [A, R] control steps before arrival in which an infrared ray met something in range.

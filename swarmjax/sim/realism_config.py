@@ -37,13 +37,13 @@ class RealismConfig(Section):
         "ideal", "sensor model: exact distance, Webots' table, or a fit to real robots"
     )
     infrared_noise: tuple[float, float] | None = setting(
-        None, "factor on the sensor model's noise; per sensor and episode", 0.0, 1000.0
+        None, "factor on the sensor model's noise; drawn per sensor and episode", 0.0, 1000.0
     )
     infrared_gain: tuple[float, float] | None = setting(
-        None, "factor on counts from reflection; per sensor and episode", above=0.0, high=10.0
+        None, "factor on counts from reflection; drawn per sensor and episode", above=0.0, high=10.0
     )
     infrared_yaw: float | None = setting(
-        None, "SD of the sensor's yaw error, rad; per sensor and episode", 0.0, math.pi
+        None, "SD of the sensor's yaw error, rad; drawn per sensor and episode", 0.0, math.pi
     )
     infrared_period: tuple[float, float] | None = setting(
         None,
@@ -53,7 +53,7 @@ class RealismConfig(Section):
     )
     reflectance: tuple[float, float] | None = setting(
         None,
-        "reflectance of each obstacle, and one for all walls; per episode; null: 1",
+        "reflectance of each obstacle, and one for all walls; drawn per episode; null: 1",
         above=0.0,
         high=1.0,
     )
@@ -106,10 +106,13 @@ class RealismConfig(Section):
         reason=_LATENCY_REASON,
     )
     target_distance_noise: float | None = setting(
-        None, "SD of the observed target distance, m; per robot and control step", 0.0, 10.0
+        None, "SD of the observed target distance, m; drawn per robot and control step", 0.0, 10.0
     )
     target_bearing_noise: float | None = setting(
-        None, "SD of the observed target bearing, rad; per robot and control step", 0.0, math.pi
+        None,
+        "SD of the observed target bearing, rad; drawn per robot and control step",
+        0.0,
+        math.pi,
     )
 
     def _check(self) -> None:

@@ -105,7 +105,7 @@ def sample(uniforms: Array, stage: Stage, spacing: Spacing, xp: Any) -> Level:
     `passage` between each other and to the walls. An obstacle without such a place is left out.
     Where the arena has room, targets keep their distance from each other and from obstacles, so
     that a robot can pass between any two arrived robots. Every target then stays reachable,
-    whatever the order of arrival.
+    in any order of arrival.
 
     Args:
       uniforms: [uniform_count(spacing)] float32 in [0, 1).

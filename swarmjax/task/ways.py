@@ -261,7 +261,7 @@ def _block(
 
 
 def _root(square: Array, xp: Any) -> Array:
-    """Returns the integer part of the square root, whatever the rounding error of `sqrt`."""
+    """Returns the integer part of the square root, and corrects the rounding error of `sqrt`."""
     root = xp.floor(xp.sqrt(square.astype(xp.float32))).astype(xp.int32)
     root = root - (root * root > square)
     return root + ((root + 1) * (root + 1) <= square)
