@@ -25,8 +25,9 @@ from swarmjax.training import program as programs
 from swarmjax.training import rollout
 from swarmjax.training.config import ProgramConfig
 
-# Every waiting level is replaced once in this many control steps. Episodes take longer.
-_REDRAW = 32
+# All waiting levels are drawn again when arenas have begun to play this share of them. A draw takes
+# about as long for thousands of arenas as for one.
+_PLAYED = 1 / 16
 
 
 class Space(NamedTuple):
@@ -55,14 +56,14 @@ class SwarmState:
       arenas: [A] the arenas; `arenas.observation` [A, R, O] is the policy's input, and
         `arenas.level` the levels that the episodes started from.
       waiting: [A] the episode that begins next in each arena.
+      played: [A] whether the arena has begun the waiting episode since it was drawn.
       key: random key of future levels.
-      clock: [] control steps since `reset`, int32.
     """
 
     arenas: EnvState
     waiting: EnvState
+    played: Array
     key: Array
-    clock: Array
 
     @property
     def observation(self) -> Array:
@@ -130,8 +131,8 @@ class Swarm:
         return SwarmState(
             arenas=self._draw(first, every),
             waiting=self._draw(second, every),
+            played=jnp.zeros(self.num_arenas, bool),
             key=key,
-            clock=jnp.zeros((), jnp.int32),
         )
 
     def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
@@ -139,8 +140,9 @@ class Swarm:
 
         Where `done` is true, the returned state belongs to the next episode, while the observation
         in the returned outcome is the last one of the old episode. The levels of the next episodes
-        are drawn ahead, and each of them is drawn again every 32 control steps. An arena that ends
-        two episodes within 32 control steps plays the same level again.
+        are drawn ahead. When a sixteenth of the arenas has begun theirs, all are drawn again. An
+        arena that ends two episodes before this plays the same level again. Under `vmap`, levels
+        are drawn in every step, which is slow: give `make_env` more arenas instead.
 
         Args:
           state: the state before the step.
@@ -155,16 +157,18 @@ class Swarm:
         arenas, came = jax.vmap(partial(env.step, self.world))(arenas, action)
         arenas = rollout.restart(arenas, state.waiting, came.done)
         arenas = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
-        key, drawn = jax.random.split(state.key)
-        waiting = self._redraw(state.waiting, state.clock, drawn)
-        return SwarmState(arenas=arenas, waiting=waiting, key=key, clock=state.clock + 1), came
+        played = state.played | came.done
+        next_up = state.waiting, played, state.key
+        enough = jnp.mean(played) >= _PLAYED
+        next_up = jax.lax.cond(enough, self._redraw, lambda *same: same, *next_up)
+        return SwarmState(arenas, *next_up), came
 
-    def _redraw(self, waiting: EnvState, clock: Array, key: Array) -> EnvState:
-        """Replaces a few of the waiting episodes. All arenas take turns."""
-        count = -(-self.num_arenas // _REDRAW)
-        which = (clock * count + jnp.arange(count)) % self.num_arenas
-        fresh = self._draw(key, which)
-        return jax.tree.map(lambda old, new: old.at[which].set(new), waiting, fresh)
+    def _redraw(
+        self, waiting: EnvState, played: Array, key: Array
+    ) -> tuple[EnvState, Array, Array]:
+        """Draws the next episode of every arena again, and returns the new arguments."""
+        key, drawn = jax.random.split(key)
+        return self._draw(drawn, jnp.arange(self.num_arenas)), jnp.zeros_like(played), key
 
     def _draw(self, key: Array, arena: Array) -> EnvState:
         """Starts one episode in each of the arenas [N]. The result's `sim` is a `PhysicsState`."""

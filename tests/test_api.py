@@ -1,6 +1,7 @@
 """Tests the four functions of swarmjax's Python interface, and what they refuse."""
 
 import importlib
+import itertools
 import pkgutil
 import subprocess
 import sys
@@ -91,6 +92,13 @@ def test_an_episode_that_is_over_gives_way_to_another(states: list[SwarmState]) 
     np.testing.assert_array_equal(states[LIMIT].arenas.clock, 0)
 
 
+def test_waiting_episodes_are_drawn_again_once_they_are_played(states: list[SwarmState]) -> None:
+    waiting = [np.array(state.waiting.level.start) for state in states]
+    changed = [bool((a != b).any()) for a, b in itertools.pairwise(waiting)]
+    assert [n + 1 for n, new in enumerate(changed) if new] == [LIMIT, 2 * LIMIT]
+    assert not any(state.played.any() for state in states)
+
+
 def test_the_step_has_the_old_episode_and_the_state_the_new_one(
     env: Swarm, states: list[SwarmState]
 ) -> None:
@@ -150,7 +158,7 @@ def test_pieces_handed_over_are_trained_and_judged(tmp_path: Path) -> None:
         result.policy, extensions=str(extensions.OWN), episodes=2, steps=5
     )
     assert [cell["cell"] for cell in found["cells"]] == ["ring"]
-    with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the observation nearest_ro"):
+    with pytest.raises(swarmjax.SwarmjaxError, match="the Python file that defines this level"):
         swarmjax.evaluate_policy(result.policy, episodes=2)
     with pytest.raises(swarmjax.SwarmjaxError, match="was trained with the network residual of "):
         swarmjax.load_policy(result.run / "policy.npz")
