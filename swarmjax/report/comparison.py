@@ -96,8 +96,8 @@ def _explain(figure: Figure, lines: Sequence[TableLine], looks: Sequence[Mapping
 
 
 def _label(line: TableLine) -> str:
-    """Labels a curve with the settings, the number of seeds and the directories of its runs."""
+    """Labels a curve with the directories of its runs, the number of seeds and the settings."""
     place, seeds = table.cells(line)[-1], words.count(len(line.seeds), "seed")
     settings = textwrap.shorten(line.settings, _LONGEST, placeholder=" ...")
-    label = f"{settings} ({seeds}, {words.shorten(place, _LONGEST)})".lstrip()
+    label = f"{words.shorten(place, _LONGEST)} ({seeds}) {settings}".rstrip()
     return label.replace("$", r"\$")  # a pair of $ would enclose a formula

@@ -221,6 +221,7 @@ def text(lines: Sequence[TableLine]) -> str:
     measures = " or ".join(sorted({line.measure for line in lines}))
     note = (
         f"Success: {measures} on the last stage, over its newest episodes that began together. "
-        f"Mean over seeds, with its 95 % bootstrap interval for {LEAST_DRAWN} seeds or more."
+        f"Mean over seeds, with its 95 % bootstrap interval for {LEAST_DRAWN} seeds or more. "
+        "Curves show the interquartile mean instead."
     )
     return "\n".join([*written, *textwrap.wrap(note, _WIDTH)])

@@ -88,9 +88,12 @@ def success(settings: TrainConfig, newest: Sequence[Row]) -> str:
     column = "success_by_stage" if by_targets else "complete_by_stage"
     shares = [row[column][-1] for row in newest]
     said = f"{what} on {settings.stage_names[-1]}: {spread(shares)}"
-    if all(share is None for share in shares):
-        return f"{said}: the run was too short on this stage"
     steps = settings.task.step_limit
+    if all(share is None for share in shares):
+        return (
+            f"{said}: the run was too short on this stage, where a first value takes "
+            f"{2 * steps * settings.arenas:,} control steps: give a larger budget or fewer arenas"
+        )
     seconds = steps * settings.task.control_step
     measured = [row for row in newest if row[column][-1] is not None]
     episodes = min(row["episodes_by_stage"][-1] for row in measured)
