@@ -70,7 +70,6 @@ def test_runs_have_a_curve_each_of_their_own_colour_and_style(tmp_path: Path) ->
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert [name.split(" (1 seed) ")[1] for name in names] == ["algo.epochs=1", "algo.epochs=3"]
     assert [name.split(" (1 seed) ")[0][-2:] for name in names] == ["_a", "/b"]
-    assert names[0].endswith("/_a)")
     assert not panel.collections  # one seed has no interval
 
 
