@@ -16,7 +16,11 @@ RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "suites.jsonl"
 CARD, CORES = "1 x NVIDIA H200", "CPU x86_64, 2 cores"
 ARENAS = (4096, 16384, 65536)
 ENVIRONMENTS = {
-    "**swarmjax**, rigid contacts": {"benchmark": "steps_per_second.environment"},
+    "**swarmjax**, planar, rigid contacts": {"benchmark": "steps_per_second.environment"},
+    "**swarmjax**, wheeled, MJX, 2 substeps": {
+        "benchmark": "steps_per_second.environment",
+        "robot": "wheeled",
+    },
     "JaxMARL JaxNav, kinematic": {"benchmark": "peer_jaxnav.environment", "reset": "pool"},
     "CAMAR, penalty forces, 3 substeps": {"benchmark": "peer_camar.environment"},
     "VMAS, penalty forces, 2 substeps, no resets": {"benchmark": "peer_vmas.environment"},
@@ -37,13 +41,14 @@ ON_CORES = {
 
 
 def read() -> list[Line]:
-    """Reads the lines of planar robots, newest last."""
+    """Reads the lines, newest last; peers count as planar."""
     lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
-    return [line for line in lines if line.get("robot", "planar") == "planar"]
+    return [{"robot": "planar"} | line for line in lines]
 
 
 def find(lines: list[Line], **where: Any) -> list[Line]:
     """Returns the lines with these entries that are of the newest commit among them."""
+    where = {"robot": "planar"} | where
     found = [line for line in lines if all(line.get(k) == v for k, v in where.items())]
     return [line for line in found if line["commit"] == found[-1]["commit"]]
 
