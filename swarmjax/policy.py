@@ -216,6 +216,8 @@ def _activate(policy: Policy, x: Any, xp: Any) -> Any:
 
 def _check(policy: Policy, memory: Any, observation: Any) -> None:
     """Refuses arguments of `step` with wrong shapes."""
+    if len(getattr(observation, "shape", ())) < 2:
+        raise PolicyError("observation has no axis of robots: give an array [..., R, O].")
     robots, (learners, size) = observation.shape[-2], policy.mean.shape
     if robots > learners and not policy.is_shared:
         raise PolicyError(f"{robots} robots are too many: the policy has {learners} networks.")

@@ -373,6 +373,13 @@ def test_robot_i_of_an_independent_policy_uses_learner_i(tmp_path: Path) -> None
         policy.act(together, np.zeros((4, SIZE), np.float32))
 
 
+def test_an_observation_without_an_axis_of_robots_is_refused(tmp_path: Path) -> None:
+    alone = saved(tmp_path / "policy.npz")
+    for seen in (np.zeros(SIZE, np.float32), [[0.0] * SIZE]):
+        with pytest.raises(PolicyError, match=r"^observation has no axis of robots: give an array"):
+            policy.act(alone, seen)  # pyright: ignore[reportArgumentType]
+
+
 @pytest.mark.parametrize("width", [8, 64, 200])
 def test_an_action_does_not_depend_on_what_is_computed_beside_it(
     tmp_path: Path, width: int

@@ -6,10 +6,8 @@ saves everything computed so far. `resume=DIR` continues.
 Examples:
   # all arms, ten seeds each: hours
   python -m swarmjax.reproduce
-  # a first look, in minutes, without verdicts
-  python -m swarmjax.reproduce seeds=3 budget=100000
-  # two arms
-  python -m swarmjax.reproduce 'arms=[curriculum,baseline]'
+  # a first look at two arms, without verdicts
+  python -m swarmjax.reproduce seeds=3 budget=100000 'arms=[curriculum,baseline]'
   # stop after 55 minutes, with all saved
   python -m swarmjax.reproduce minutes=55 out=runs/paper
   # go on with a reproduction that was stopped
