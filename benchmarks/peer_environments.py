@@ -11,11 +11,12 @@ line for each number of arenas. It times calls of `steps` control steps with ran
   one new map per `reset_ratio` arenas, and the arenas whose episodes end in this step share these
   maps.
 - `jaxnav` is JaxMARL's environment of differential drives with range sensors. `step=pool` calls
-  JaxNav's `step_env`, and restarts arenas from a pool of states that were drawn beforehand. This is
-  JaxNav's best case. `step=default` calls JaxNav's own `step`, which draws a whole map for every
+  JaxNav's `step_env`, and restarts arenas from a pool of states that were drawn beforehand. This
+  favours JaxNav. `step=default` calls JaxNav's own `step`, which draws a whole map for every
   arena and step, and discards nearly all of these maps.
 """
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,18 +32,19 @@ from benchmarks.peers import PeerConfig
 from swarmjax import epuck
 from swarmjax.config import about
 
-SUBSTEPS = 2  # vmas.simulator.core.World's own default
+SUBSTEPS = 2  # of VMAS's navigation scenario
 FRAMESKIP = 2  # CAMAR's default; a control step has three substeps
 DT = 0.032 / (FRAMESKIP + 1)  # s
 CAMAR_CELLS = 6  # cells per side; they are 0.2 m wide, so the arena is 1.2 m wide
 # JaxNav's cells are 1 m wide and its robots have a radius of 0.3 m, so our lengths are scaled by
-# 0.3 / 0.037. Our rays of 0.04 m would be 0.32 m long here. They are 0.3 m long, because samples
-# along a ray have JaxNav's default spacing of 0.05 m.
+# 0.3 / 0.037. Rays start at the robot's centre, and their last sample always counts as a hit. Thus
+# 13 samples up to 0.68 m, about 0.05 m apart as by JaxNav's default, see 0.04 m beyond the hull.
 RADIUS = 0.3
-BEAMS, RANGE, RESOLUTION = 8, 0.3, 0.05
-JAXNAV_CELLS = 7  # cells per side; the outer cells are walls
+BEAMS, RANGE, RESOLUTION = 8, 0.68, 0.05
+JAXNAV_CELLS = 12  # cells per side; the outer cells are walls, so the arena is 1.23 m wide
+JAXNAV_FILL = 0.07  # 0 to 6 of 100 cells are obstacles, 3 on average
 RESETS = {
-    "pool": "one of a pool of states that were drawn beforehand, at random: its best case",
+    "pool": "one of a pool of states that were drawn beforehand, at random",
     "default": "a new map for every arena and step, used where an episode ends: its default",
 }
 # What a step of each peer includes.
@@ -87,8 +89,8 @@ def vmas_task(config: PeerConfig) -> dict[str, Any]:
         "world_spawning_x": 0.6,
         "world_spawning_y": 0.6,
         "n_lidar_rays": 8,
-        "lidar_range": 0.04,
-        "agent_radius": 0.037,
+        "lidar_range": epuck.SENSOR_RANGE + epuck.HULL_RADIUS,  # from the centre
+        "agent_radius": epuck.HULL_RADIUS,
         "shared_rew": False,
         "max_steps": config.step_limit,
     }
@@ -204,10 +206,16 @@ def _camar_steps(world: Any, config: PeerConfig, carry: Any, _: None) -> tuple[A
         shape = (world.num_envs, config.robots, 2)
         action = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
         seen, state, reward, _, _ = world.step(step_key, state, action)
-        return (state, key), jnp.sum(reward) + jnp.sum(seen)
+        return (state, key), _sums((seen, reward))
 
     carry, rewards = jax.lax.scan(body, carry, length=config.steps)
     return carry, jnp.sum(rewards)
+
+
+def _sums(results: Any) -> Array:
+    """Sums results for each arena, [A], as our benchmark does."""
+    sums = [jnp.sum(x, axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(results)]
+    return functools.reduce(jnp.add, sums)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,10 +237,13 @@ def jaxnav_task(config: PeerConfig) -> dict[str, Any]:
         "lidar_num_beams": BEAMS,
         "lidar_max_range": RANGE,
         "lidar_range_resolution": RESOLUTION,
-        "map_id": "Grid-Rand-Poly",
-        "map_params": {"map_size": (JAXNAV_CELLS, JAXNAV_CELLS), "fill": 0.1},
+        "lidar_angle_factor": 1.0 - 1.0 / BEAMS,  # its range holds both ends: even spacing
+        "map_id": "Grid-Rand-Poly",  # robots are squares of 0.5 m; 0.2.0 cannot step discs
+        "map_params": {"map_size": (JAXNAV_CELLS, JAXNAV_CELLS), "fill": JAXNAV_FILL},
         "max_v": 1.0,
         "max_w": epuck.MAX_TURN_RATE,
+        "max_v_acc": 1.0 / 0.032,  # any command is reached in one control step, as in ours
+        "max_w_acc": 2.0 * epuck.MAX_TURN_RATE / 0.032,
         "goal_radius": 0.4,
         "dt": 0.032,
         "max_steps": config.step_limit,
@@ -323,8 +334,7 @@ def _jaxnav_steps(
         actions = dict(zip(world.agents, drawn, strict=True))
         keys = jax.random.split(step_key, arenas)
         seen, states, reward, _, _ = step(world, how, pool, keys, states, actions)
-        sums = [jnp.sum(x) for x in jax.tree.leaves((seen, reward))]
-        return (states, key), jnp.sum(jnp.stack(sums))
+        return (states, key), _sums((seen, reward))
 
     carry, rewards = jax.lax.scan(body, carry, length=config.steps)
     return carry, jnp.sum(rewards)
