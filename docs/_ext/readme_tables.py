@@ -86,7 +86,7 @@ def _of_trainers(lines: list[Line]) -> str:
 
 
 def _seconds(seeds: list[Line], share: str) -> str:
-    """Returns the median and range of the seconds to a share, and how many seeds never got there."""
+    """Returns the median and range of the seconds to a share, and how many never got there."""
     found = sorted(s for line in seeds if (s := line[f"seconds_to_{share}"]) is not None)
     if not found:
         return f"never; {len(seeds)} seeds"
