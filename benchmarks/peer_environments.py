@@ -34,7 +34,8 @@ from swarmjax.config import about
 
 SUBSTEPS = 2  # of VMAS's navigation scenario
 FRAMESKIP = 2  # CAMAR's default; a control step has three substeps
-DT = 0.032 / (FRAMESKIP + 1)  # s
+CONTROL_STEP = 0.032  # s
+DT = CONTROL_STEP / (FRAMESKIP + 1)  # s
 CAMAR_CELLS = 6  # cells per side; they are 0.2 m wide, so the arena is 1.2 m wide
 # JaxNav's cells are 1 m wide and its robots have a radius of 0.3 m, so our lengths are scaled by
 # 0.3 / 0.037. Rays start at the robot's centre, and their last sample always counts as a hit. Thus
@@ -242,10 +243,10 @@ def jaxnav_task(config: PeerConfig) -> dict[str, Any]:
         "map_params": {"map_size": (JAXNAV_CELLS, JAXNAV_CELLS), "fill": JAXNAV_FILL},
         "max_v": 1.0,
         "max_w": epuck.MAX_TURN_RATE,
-        "max_v_acc": 1.0 / 0.032,  # any command is reached in one control step, as in ours
-        "max_w_acc": 2.0 * epuck.MAX_TURN_RATE / 0.032,
+        "max_v_acc": 1.0 / CONTROL_STEP,  # any command is reached in one control step, as in ours
+        "max_w_acc": 2.0 * epuck.MAX_TURN_RATE / CONTROL_STEP,
         "goal_radius": 0.4,
-        "dt": 0.032,
+        "dt": CONTROL_STEP,
         "max_steps": config.step_limit,
     }
 
