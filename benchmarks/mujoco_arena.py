@@ -47,12 +47,11 @@ class MujocoArena:
       arenas: [A=1] current state of the arena; None before the first level.
     """
 
-    def __init__(self, settings: EvaluateConfig, first: int = 0) -> None:
+    def __init__(self, settings: EvaluateConfig) -> None:
         """Compiles the arena.
 
         Args:
           settings: stage, robot, task, realism, substeps and seed of the levels.
-          first: number of the first level.
 
         Raises:
           ConfigError: if `rewards` does not support a term of the reward, or robots keep driving
@@ -69,7 +68,7 @@ class MujocoArena:
         robots = settings.stage.robots
         told = replace(settings, action="mean")  # exactly the given action, without sampling
         self.judge = engine_c.load(told, _puppet(told, np.zeros((robots, ACTION_SIZE))))
-        self._number = first
+        self._number = 0
         self.arenas: Arenas | None = None
 
     def reset(self) -> np.ndarray:

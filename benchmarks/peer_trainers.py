@@ -1,7 +1,7 @@
-"""How fast do other projects train robots on environments of their own?
+"""How fast do other projects train robots?
 
-`python -m benchmarks.peers who=benchmarl|jaxmarl_ippo [arenas=4096] [key=value ...]` prints a JSON
-line for each number of arenas. The networks, the rollout length and the numbers of epochs and
+`python -m benchmarks.peers who=benchmarl|jaxmarl_ippo|sb3 [arenas=4096] [key=value ...]` prints a
+JSON line for each number of arenas. The networks, the rollout length and the numbers of epochs and
 minibatches are those of swarmjax, so batches have the same size.
 
 - `benchmarl` trains VMAS's navigation scenario with BenchMARL's IPPO, which uses PyTorch
@@ -14,6 +14,10 @@ minibatches are those of swarmjax, so batches have the same size.
   of 64, one policy for all robots, a clipped value loss, advantages normalised in each minibatch,
   and samples shuffled individually. The learning rate, the costs and the clip range come from that
   script's configuration. Episodes start from a pool of states, as in the best case of `jaxnav`.
+- `sb3` trains with Stable-Baselines3's PPO (`torch-peers.txt`) on swarmjax's environment, through
+  the adapter `SwarmVecEnv`: every robot is one environment, and all robots share one policy. It
+  takes the keys of `swarmjax.train`. Observations are not normalised. Robots that have arrived stay
+  in the batch, so all robot steps count. The first rollout and update are not timed.
 """
 
 import contextlib
@@ -36,7 +40,11 @@ from jax import Array
 from benchmarks import lines, peer_environments, peers, timing
 from benchmarks.lines import Line
 from benchmarks.peers import PeerConfig
-from swarmjax.config import about, to_dict
+from swarmjax import environment
+from swarmjax.config import Section, about, to_dict
+from swarmjax.ppo import optimizer
+from swarmjax.run.load_settings import load_train
+from swarmjax.run.settings import TrainConfig
 
 _WARM = 2  # warm-up iterations of BenchMARL
 ACTION_SIZE = 2
@@ -368,4 +376,65 @@ def jaxmarl_ippo(words: Sequence[str]) -> Iterator[Line]:
             "resets": peer_environments.RESETS["pool"],
             "settings": to_dict(config) | {"task": peer_environments.jaxnav_task(config)},
             **peers.with_jax("jaxmarl"),
+        }
+
+
+# Stable-Baselines3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sb3Config(Section):
+    """Settings for measuring Stable-Baselines3."""
+
+    arenas: tuple[int, ...] = field(
+        default=(128,), metadata=about("numbers of arenas, one after the other", 1, 2**20)
+    )
+    repeats: int = field(default=16, metadata=about("timed updates; 16 span an episode", 1, 1000))
+
+
+def sb3_settings(trained: TrainConfig, robots: int) -> dict[str, Any]:
+    """Returns our settings under the names of Stable-Baselines3, for `robots` robots in total."""
+    algo = trained.algo
+    return {
+        "n_steps": algo.rollout_length,
+        "batch_size": robots * algo.rollout_length // algo.num_minibatches,
+        "n_epochs": algo.epochs,
+        "gamma": algo.discount,
+        "gae_lambda": algo.gae_lambda,
+        "clip_range": algo.clip_epsilon,
+        "learning_rate": optimizer.learning_rates(algo, trained.updates)["actor"],
+        "vf_coef": algo.value_cost,
+        "ent_coef": algo.entropy_cost,
+        "max_grad_norm": algo.max_grad_norm,
+        "policy_kwargs": {
+            "net_arch": list(algo.hidden_sizes),
+            "log_std_init": np.log(algo.initial_std),
+        },
+        "seed": trained.seed,
+    }
+
+
+def sb3(words: Sequence[str]) -> Iterator[Line]:
+    """Trains with Stable-Baselines3; yields a JSON line for each number of arenas."""
+    config, rest = lines.parse(Sb3Config, words)
+    library, torch = peers.find("stable_baselines3", peers.TORCH), peers.find("torch", peers.TORCH)
+    adapter = peers.find("swarmjax.adapters.sb3", peers.TORCH)
+    for arenas in config.arenas:
+        trained = load_train(["stage=s6", *rest, f"arenas={arenas}"])
+        robots = adapter.SwarmVecEnv(environment.load(trained))
+        chosen = sb3_settings(trained, robots.num_envs)
+        model = library.PPO("MlpPolicy", robots, device="cpu", **chosen)
+        calls_s = []
+        for call in range(1 + config.repeats):
+            began = time.perf_counter()
+            model.learn(robots.num_envs * chosen["n_steps"], reset_num_timesteps=call == 0)
+            calls_s.append(time.perf_counter() - began)
+        rate = chosen["n_steps"] * arenas / timing.spread(calls_s[1:])["call_s"]
+        yield {
+            "benchmark": "peer_sb3",
+            "trainer": "Stable-Baselines3 PPO, swarmjax's environment",
+            "robot": trained.robot.body,
+            **peers.training(trained.stage[-1].robots, arenas, rate, calls_s[1:]),
+            "settings": to_dict(config) | {"ppo": chosen},
+            **peers.with_torch(torch, "cpu", "stable-baselines3", "gymnasium"),
         }

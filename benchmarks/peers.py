@@ -2,9 +2,9 @@
 
 `python -m benchmarks.peers who=NAME [key=value ...]` prints the JSON lines of a peer. `vmas`,
 `camar` and `jaxnav` are environments (`benchmarks.peer_environments`). `benchmarl` and
-`jaxmarl_ippo` are trainers with environments of their own (`benchmarks.peer_trainers`). `sb3` and
-`paper_way` train our robots in MuJoCo C (`benchmarks.peer_mujoco_c`). The peer's functions say
-which keys it has and how it is measured.
+`jaxmarl_ippo` are trainers with environments of their own, and `sb3` trains on ours
+(`benchmarks.peer_trainers`). `paper_way` trains our robots in MuJoCo C
+(`benchmarks.peer_paper_way`). The peer's functions say which keys it has and how it is measured.
 
 A peer is installed as an optional extra of this package or from `torch-peers.txt`. If a peer is
 missing, the command prints one line with the reason as `skipped`, and exits with code 0.
@@ -31,8 +31,8 @@ PEERS = {
     "jaxnav": "peer_environments",
     "benchmarl": "peer_trainers",
     "jaxmarl_ippo": "peer_trainers",
-    "sb3": "peer_mujoco_c",
-    "paper_way": "peer_mujoco_c",
+    "sb3": "peer_trainers",
+    "paper_way": "peer_paper_way",
 }
 
 

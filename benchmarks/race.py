@@ -13,14 +13,16 @@ Brax differs in these points:
 - Adam's epsilon;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
-- no compiler options for XLA (`program.compiler_options`);
+- no loss that keeps mean actions within the range of commands;
 - no mask, so robots that have arrived stay in its batch (docs/adapters.md).
 
-All of Brax's robot steps count as transitions. Our trainer's transitions are only the robot steps
-that it learns from.
+Brax gets our option for XLA (`program.compiler_options`) only through the environment variable
+`XLA_FLAGS`, as in `suites.yaml`. All of Brax's robot steps count as transitions. Our trainer's
+transitions are only the robot steps that it learns from.
 
-`settings=playground` gives Brax the settings that MuJoCo Playground uses for walking robots
-(`PLAYGROUND`) instead of ours. The networks stay the same.
+`settings=bounded` gives Brax its own default for actions: the tanh of a normal sample, whose
+standard deviation depends on the observation. `settings=playground` gives Brax the settings and
+networks that MuJoCo Playground uses for walking robots (`PLAYGROUND`), and Brax's initialisation.
 
 The reported seconds are training time alone. Brax compiles during its first two calls. For each of
 these two calls, the median time of the later calls counts as training, and the rest of the call
@@ -36,26 +38,32 @@ from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import linen
 
-from benchmarks import learners_judge, lines, peers, steps_per_second, timing
+from benchmarks import lines, peers, steps_per_second, timing
 from swarmjax import environment
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
+from swarmjax.evaluate import engine_mjx
+from swarmjax.evaluate import judge as levels_judge
 from swarmjax.ppo import optimizer
-from swarmjax.ppo.networks import Sizes
-from swarmjax.ppo.ppo import PPO, LearnerState
+from swarmjax.ppo.ppo import LearnerState
 from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
+from swarmjax.task import stage as task_stage
 from swarmjax.task import world as task_world
+from swarmjax.task.level import Level
+from swarmjax.task.world import World
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
 SHARES = (0.90, 0.95)
 # From MuJoCo Playground 0.2.0, `config/locomotion_params.py`, `brax_ppo_config`. Its minibatches
-# hold 256 of 8,192 robots. Settings that Playground leaves out are the defaults of Brax 0.14.2.
+# hold 256 of 8,192 robots. Settings that Playground leaves out are the defaults of Brax 0.14.2,
+# such as the activation, the distribution of actions, and how networks are initialised.
 PLAYGROUND: dict[str, Any] = {
     "unroll_length": 20,
     "num_minibatches": 32,
@@ -68,11 +76,17 @@ PLAYGROUND: dict[str, Any] = {
     "learning_rate": 3e-4,
     "max_grad_norm": 1.0,
 }
+PLAYGROUND_NETWORKS = {
+    "policy_hidden_layer_sizes": (128,) * 4,
+    "value_hidden_layer_sizes": (256,) * 5,
+}
 # Names of Brax's results in tables, by the value of `settings`.
 BRAX = {
-    "ours": "Brax PPO, this environment",
-    "playground": "Brax PPO as MuJoCo Playground sets it, this environment",
+    "ours": "Brax PPO, our settings",
+    "bounded": "Brax PPO, our settings and its bounded actions",
+    "playground": "Brax PPO, Playground's settings",
 }
+ACTION_SIZE = 2
 _COMPILING = 2  # Brax may compile in this many first calls; the second takes the first's results
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
@@ -90,8 +104,9 @@ class RaceConfig(Section):
     points: int = field(default=30, metadata=about("points at which to judge", 4, 1000))
     levels: int = field(default=256, metadata=about("levels to judge on", 1, 2**20))
     level_seed: int = field(default=2, metadata=about("of these", 0, MAX_COUNT))
-    settings: Literal["ours", "playground"] = field(
-        default="ours", metadata=about("settings of Brax: ours, or those of MuJoCo Playground")
+    settings: Literal["ours", "bounded", "playground"] = field(
+        default="ours",
+        metadata=about("settings of Brax: ours, with its bounded actions, or MuJoCo Playground's"),
     )
 
 
@@ -113,19 +128,49 @@ class Course(NamedTuple):
     compile_s: float
 
 
-Judge = Callable[[LearnerState], float]
+Judge = Callable[[Any], float]
+# Takes a policy's parameters and observations [E, R, O]; returns the mean actions [E, R, U].
+Act = Callable[[Any, jax.Array], jax.Array]
 
 
-def load_judge(race: RaceConfig, trained: TrainConfig) -> Judge:
-    """Makes both trainers' judge; it maps learners [N=1, L=1] to the share of targets reached."""
-    stage = trained.stage[-1]
-    parts = trained.robot, trained.task, trained.realism, trained.sim
-    world = task_world.load((stage,), *parts, arenas=race.levels)
-    levels = learners_judge.draw_levels(world, stage, race.level_seed, race.levels)
-    ppo = programs.load_ppo(trained, world)
-    run = partial(learners_judge.outcomes, world, ppo, steps=trained.task.step_limit)
-    call = jax.jit(jax.vmap(run, in_axes=(0, None)))
-    return lambda learners: float(np.mean(call(learners, levels).targets_reached))
+def load_judge(race: RaceConfig, trained: TrainConfig, act: Act) -> Judge:
+    """Makes a judge, which maps the parameters of a policy to the share of targets reached."""
+    world = _world(trained, race.levels)
+    one, draw = task_stage.single(trained.stage[-1], world.drawings), levels_judge.draw_level
+    drawn = (
+        draw(one, world.spacing, race.level_seed, episode, world.drawings)
+        for episode in range(race.levels)
+    )
+    levels = Level(*map(np.stack, zip(*drawn, strict=True)))
+
+    @jax.jit
+    def share(params: Any, levels: Level) -> jax.Array:
+        steps = trained.task.step_limit
+        arenas, *_ = engine_mjx.run(
+            world, lambda _, seen: (None, act(params, seen.observation)), levels, steps, None
+        )
+        return jnp.mean(jnp.mean(arenas.arrived, axis=-1))
+
+    return lambda params: float(share(params, levels))
+
+
+def _world(trained: TrainConfig, arenas: int) -> World:
+    """Compiles the environment for so many arenas, with no room for absent obstacles."""
+    *_, stage = trained.stage
+    sim = replace(trained.sim, max_robots=stage.robots, max_obstacles=stage.obstacles)
+    parts = trained.robot, trained.task, trained.realism, sim
+    return task_world.load((stage,), *parts, arenas=arenas)
+
+
+def act_ours(trained: TrainConfig) -> Act:
+    """Makes the function that acts for learners [N=1, L=1] of our trainer."""
+    ppo = programs.load_ppo(trained, _world(trained, 1))
+
+    def act(learners: LearnerState, seen: jax.Array) -> jax.Array:
+        still = jnp.zeros((*seen.shape[:-1], ACTION_SIZE))
+        return ppo.act(jax.tree.map(lambda x: x[0, 0], learners), seen, still)[0]
+
+    return act
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
@@ -143,7 +188,7 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
     program, schedule = programs.load(trained)
     state = jax.jit(mesh.init(program))(schedule)
     compiled = compile_chunk(program, schedule, state)
-    judge, updates = load_judge(race, trained), points(race, trained)
+    judge, updates = load_judge(race, trained, act_ours(trained)), points(race, trained)
     judge(jax.device_get(state.learners))  # compiles, and lets Warp build its kernels
     seconds, shares, transitions = [], [], []
     for n in np.diff(updates, prepend=0):
@@ -179,7 +224,7 @@ def brax_settings(race: RaceConfig, trained: TrainConfig) -> dict[str, Any]:
       Plain data.
     """
     robots = trained.arenas * trained.sim.robots
-    given = {"ours": _our_settings(trained), "playground": PLAYGROUND}[race.settings]
+    given = PLAYGROUND if race.settings == "playground" else _our_settings(trained)
     updates = _evenly(race, _brax_updates(trained, given))
     return given | {
         "num_timesteps": int(updates[-1]) * robots * given["unroll_length"],
@@ -214,72 +259,56 @@ def _our_settings(trained: TrainConfig) -> dict[str, Any]:
     }
 
 
-def network_factory(trained: TrainConfig) -> Callable[..., Any]:
-    """Makes Brax's networks with our layers, activation, distribution and initialisation."""
+def network_factory(race: RaceConfig, trained: TrainConfig) -> Callable[..., Any]:
+    """Makes Brax's networks: ours, ours with bounded actions, or those of Playground."""
     networks = peers.find("brax.training.agents.ppo.networks", "the extra brax")
-    algo, orthogonal = trained.algo, jax.nn.initializers.orthogonal
+    if race.settings == "playground":
+        return partial(networks.make_ppo_networks, **PLAYGROUND_NETWORKS)
+    algo, bounded = trained.algo, race.settings == "bounded"
     return partial(
         networks.make_ppo_networks,
         policy_hidden_layer_sizes=algo.hidden_sizes,
         value_hidden_layer_sizes=algo.hidden_sizes,
         activation=_ACTIVATIONS[algo.activation],
-        distribution_type="normal",
+        distribution_type="tanh_normal" if bounded else "normal",
         noise_std_type="log",
         init_noise_std=algo.initial_std,
-        policy_network_kernel_init_fn=orthogonal,
-        policy_network_kernel_init_kwargs={"scale": math.sqrt(2.0)},
-        value_network_kernel_init_fn=lambda: _critic_kernel,
-        mean_kernel_init_fn=orthogonal,
-        mean_kernel_init_kwargs={"scale": 0.01},
+        policy_network_kernel_init_fn=lambda: partial(_kernel, (1 + bounded) * ACTION_SIZE),
+        value_network_kernel_init_fn=lambda: partial(_kernel, 1),
+        mean_kernel_init_fn=lambda: partial(_kernel, ACTION_SIZE),
     )
 
 
-def _critic_kernel(key: jax.Array, shape: Any, dtype: Any = None) -> jax.Array:
-    """Initialises a layer of Brax's critic as ours; its last layer is the one with one output."""
-    gain = 0.01 if shape[-1] == 1 else math.sqrt(2.0)
+def _kernel(outputs: int, key: jax.Array, shape: tuple[int, ...], dtype: Any = None) -> jax.Array:
+    """Initialises a layer of Brax's networks as ours; the last layer has `outputs` outputs."""
+    gain = 0.01 if shape[-1] == outputs else math.sqrt(2.0)
     return jax.nn.initializers.orthogonal(gain)(key, shape, dtype)
 
 
-def as_learners(trained: TrainConfig, params: Any) -> LearnerState:
-    """Converts Brax's policy to our learners [N=1, L=1], for the judge.
-
-    Args:
-      trained: our config; its networks have the same shapes as Brax's networks.
-      params: Brax's observation moments, and the parameters of its policy and critic.
-
-    Returns:
-      Learners that act like Brax's policy unless an observation exceeds our limit. The critic of
-      these learners is newly initialised instead of Brax's critic.
-    """
-    moments, policy, _ = params
-    sizes = Sizes(moments.mean.shape[-1], 2)
-    mine = PPO.make(trained.algo, sizes, 1).init(jax.random.key(0))
-    layers = policy["params"]
-    torso = {name: layers["MLP_0"][name] for name in mine.params["actor"]["torso"]}
-    actor = {
-        "torso": torso,
-        "mean": layers["Dense_0"],
-        "log_std": layers["std_logparam"]["log_value"],
-    }
-    made = replace(
-        mine,
-        params=mine.params | {"actor": actor},
-        normalizer=replace(mine.normalizer, mean=moments.mean, variance=moments.std**2),
-    )
-    return jax.tree.map(lambda x: jax.numpy.asarray(x)[None, None], made)
+def act_brax(race: RaceConfig, trained: TrainConfig) -> Act:
+    """Makes the function that acts for the parameters that Brax trained."""
+    networks = peers.find("brax.training.agents.ppo.networks", "the extra brax")
+    statistics = peers.find("brax.training.acme.running_statistics", "the extra brax")
+    wide = trained.algo.normalize_observations
+    normal = {"preprocess_observations_fn": statistics.normalize} if wide else {}
+    sizes = programs.load_ppo(trained, _world(trained, 1)).sizes
+    made = network_factory(race, trained)(sizes.observation, sizes.action, **normal)
+    choose, key = networks.make_inference_fn(made), jax.random.key(0)
+    return lambda params, seen: choose(params, deterministic=True)(seen, key)[0]
 
 
 def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     """Trains with Brax's PPO; raises MissingPeerError if Brax is not installed."""
     brax_ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
-    judge, given = load_judge(race, trained), brax_settings(race, trained)
+    judge = load_judge(race, trained, act_brax(race, trained))
+    given = brax_settings(race, trained)
     shares: list[float] = []
     seconds: list[float] = []
 
     def look(step: int, _: Any, params: Any) -> None:
         """Evaluates the policy; the first call comes before training and compiles the judge."""
-        shares.append(judge(as_learners(trained, params)))
+        shares.append(judge(params))
 
     with adapter.mended_jax():
         brax_ppo.train(
@@ -288,7 +317,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
             max_devices_per_host=1,
             run_evals=False,
             num_eval_envs=given["num_envs"],
-            network_factory=network_factory(trained),
+            network_factory=network_factory(race, trained),
             policy_params_fn=look,
             progress_fn=lambda _, metrics: seconds.append(metrics["training/walltime"]),
             **given,
@@ -370,6 +399,9 @@ def _check(race: RaceConfig, trained: TrainConfig) -> None:
             f"{stage.robots} robots, and Brax does not support absent ones: give "
             f"sim.max_robots={stage.robots}."
         )
+    for key, most in (("policy", "shared"), ("memory", "none")):
+        if (value := getattr(trained.algo, key)) != most:
+            raise ConfigError(f"algo.{key} is {value}, and Brax has only {most}: give that.")
     updates = trained.updates
     if race.trainer == "brax" and race.settings == "playground":
         _check_playground(trained)

@@ -9,7 +9,7 @@ import steering
 from entries import INFRARED
 from sentences import refusal
 
-from benchmarks import mujoco_arena, peer_mujoco_c
+from benchmarks import mujoco_arena, peer_paper_way
 from benchmarks.mujoco_arena import MujocoArena
 from swarmjax import policy
 from swarmjax.evaluate import engine_c
@@ -27,9 +27,9 @@ def settings() -> EvaluateConfig:
 def test_an_arena_does_what_the_judge_does(settings: EvaluateConfig, tmp_path: Path) -> None:
     trained = policy.load(steering.write(tmp_path / "p.npz"))
     judge = engine_c.load(settings, trained)
-    levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(5, 7)]
+    levels = [engine_c.draw_level(judge.stage, judge.spacing, 3, n) for n in range(2)]
     judged = engine_c.simulate(judge, levels)
-    arena = MujocoArena(settings, first=5)
+    arena = MujocoArena(settings)
     for n in range(2):
         seen, over, steps = arena.reset(), False, 0
         while not over:
@@ -86,11 +86,11 @@ def test_a_rule_of_arrival_that_it_does_not_know_is_refused(settings: EvaluateCo
 def test_returns_end_with_their_episodes() -> None:
     # An episode ends at the second reward, so the first return is 1 + 2 / 2. The last three rewards
     # belong to the next episode, and each later reward is halved once per step.
-    found = peer_mujoco_c.discounted([1, 2, 3, 4, 5], [False, True, False, False, False], 0.5)
+    found = peer_paper_way.discounted([1, 2, 3, 4, 5], [False, True, False, False, False], 0.5)
     np.testing.assert_array_equal(found, [2.0, 2.0, 6.25, 6.5, 5.0])
 
 
 def test_the_first_call_is_a_warm_up() -> None:
     numbers: list[int] = []
-    assert len(peer_mujoco_c.timed(numbers.append, 1e-9)) == len(numbers) - 1
+    assert len(peer_paper_way.timed(numbers.append, 1e-9)) == len(numbers) - 1
     assert numbers[:2] == [0, 1]
