@@ -4,8 +4,8 @@
 line for each number of arenas. It times calls of `steps` control steps with random actions.
 
 - `vmas` is VMAS's navigation scenario, the PyTorch environment most similar to ours. VMAS leaves
-  resets to the caller, so the timed calls have no resets. This is VMAS's best case. The line also
-  has the time for resetting all arenas. It needs the packages in `torch-peers.txt`.
+  resets to the caller, so the timed calls have no resets. This favours VMAS. The line also has the
+  time for resetting all arenas. It needs the packages in `torch-peers.txt`.
 - `camar` is the most similar to ours among the JAX environments for path finding in continuous
   space, with differential drives. CAMAR's own wrapper resets arenas optimistically: each step draws
   one new map per `reset_ratio` arenas, and the arenas whose episodes end in this step share these
@@ -53,7 +53,7 @@ COUNTED = {
     "vmas": {
         "step": "control step: two substeps of penalty contacts between discs in the plane, "
         "holonomic robots, 8 rays that see robots alone, no obstacles, reward",
-        "resets": "none in the timed calls (VMAS leaves them to the caller): its best case",
+        "resets": "none in the timed calls: VMAS leaves them to the caller",
         "precision": "float32, PyTorch without compilation",
     },
     "camar": {

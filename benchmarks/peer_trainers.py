@@ -13,7 +13,7 @@ minibatches are those of swarmjax, so batches have the same size.
   file is a rewrite of `baselines/IPPO/ippo_ff_mabrax.py` (commit c793d09): networks with two layers
   of 64, one policy for all robots, a clipped value loss, advantages normalised in each minibatch,
   and samples shuffled individually. The learning rate, the costs and the clip range come from that
-  script's configuration. Episodes start from a pool of states, as in the best case of `jaxnav`.
+  script's configuration. Episodes start from a pool of states, as with `jaxnav step=pool`.
 - `sb3` trains with Stable-Baselines3's PPO (`torch-peers.txt`) on swarmjax's environment, through
   the adapter `SwarmVecEnv`: every robot is one environment, and all robots share one policy. It
   takes the keys of `swarmjax.train`. Observations are not normalised. Robots that have arrived stay

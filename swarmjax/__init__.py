@@ -1,4 +1,4 @@
-"""E-puck swarms in MuJoCo MJX: thousands of arenas, a curriculum and PPO in one compiled program.
+"""E-puck swarms in MJX or an own contact solver: a curriculum and PPO in one compiled program.
 
 Python code calls `make_env`, `train_policy`, `evaluate_policy` and `load_policy`. These functions
 raise `SwarmjaxError` if an argument is invalid or a run breaks. Importing this package imports

@@ -1,7 +1,8 @@
-"""Prints README's tables of speeds and trainers from `benchmarks/results/suites.jsonl`.
+"""Prints the tables of speeds and trainers in README, docs/benchmarks.md and docs/performance.md.
 
-`python docs/_ext/readme_tables.py`. Of equal measurements, those of the newest commit count. All
-figures of a table must come from one commit on one device, which is printed below it.
+`python docs/_ext/readme_tables.py` reads `benchmarks/results/suites.jsonl`. Of equal measurements,
+those of the newest commit count. All figures of a table must come from one commit on the devices
+that are printed below it. A speed is a median; its range follows if it is wider than 10 %.
 """
 
 import json
@@ -15,10 +16,12 @@ Line = dict[str, Any]
 RESULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "suites.jsonl"
 CARD, CORES = "1 x NVIDIA H200", "CPU x86_64, 2 cores"
 ARENAS = (4096, 16384, 65536)
+ARENAS_ON_CORES = (128, 1024, 4096)
+ENVIRONMENT, TRAINING = "steps_per_second.environment", "steps_per_second.training"
 ENVIRONMENTS = {
-    "**swarmjax**, planar, rigid contacts": {"benchmark": "steps_per_second.environment"},
-    "**swarmjax**, wheeled, MJX, 2 substeps": {
-        "benchmark": "steps_per_second.environment",
+    "**swarmjax**, planar, rigid contacts": {"benchmark": ENVIRONMENT},
+    "**swarmjax**, wheeled, MJX with swarmjax's solver, 2 substeps": {
+        "benchmark": ENVIRONMENT,
         "robot": "wheeled",
     },
     "JaxMARL JaxNav, kinematic": {"benchmark": "peer_jaxnav.environment", "reset": "pool"},
@@ -27,61 +30,86 @@ ENVIRONMENTS = {
 }
 TRAINERS = {
     "**swarmjax**": "swarmjax",
-    "Brax PPO, our settings": "Brax PPO, this environment",
-    "Brax PPO, Playground's update settings": (
-        "Brax PPO as MuJoCo Playground sets it, this environment"
-    ),
+    "Brax PPO, our settings": "Brax PPO, our settings",
+    "Brax PPO, our settings, its bounded actions": "Brax PPO, our settings and its bounded actions",
+    "Brax PPO, Playground's settings": "Brax PPO, Playground's settings",
 }
 ON_CORES = {
-    "**swarmjax**, 128 arenas": {"benchmark": "steps_per_second.training", "arenas": 128},
-    "BenchMARL IPPO, VMAS, 64 arenas": {"benchmark": "peer_benchmarl", "arenas": 64},
-    "Stable-Baselines3, MuJoCo C, 16 arenas": {"benchmark": "cpu_sb3", "arenas": 16},
-    "PPO-PyTorch's way, MuJoCo C, one arena": {"benchmark": "cpu_paper_way"},
+    "**swarmjax**": {"benchmark": TRAINING},
+    "Stable-Baselines3, swarmjax's environment": {"benchmark": "peer_sb3"},
+    "BenchMARL IPPO, VMAS": {"benchmark": "peer_benchmarl"},
+}
+STEPPED_BY = {
+    ("planar", "auto"): "swarmjax's own solver for discs and boxes",
+    ("planar", "mjx"): "MJX",
+    ("wheeled", "auto"): "GPU: MJX with swarmjax's contact solver; CPU: MJX",
+    ("wheeled", "mjx"): "MJX",
 }
 
 
 def read() -> list[Line]:
     """Reads the lines, newest last; peers count as planar."""
     lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
-    return [{"robot": "planar"} | line for line in lines]
+    return [{"robot": "planar", "solver": "auto"} | line for line in lines]
 
 
 def find(lines: list[Line], **where: Any) -> list[Line]:
     """Returns the lines with these entries that are of the newest commit among them."""
-    where = {"robot": "planar"} | where
+    where = {"robot": "planar", "solver": "auto"} | where
     found = [line for line in lines if all(line.get(k) == v for k, v in where.items())]
     return [line for line in found if line["commit"] == found[-1]["commit"]]
 
 
 def tables(lines: list[Line]) -> Iterator[str]:
-    """Yields the tables of environments, trainers, and trainers on two cores."""
-    used: list[Line] = []
-    heads = [f"{arenas:,} arenas" for arenas in ARENAS]
-    rows = []
-    for name, where in ENVIRONMENTS.items():
-        each = [find(lines, device=CARD, arenas=arenas, **where)[-1] for arenas in ARENAS]
-        rows.append([name, *(_millions(line["robot_steps_per_s"]) for line in each)])
-        used += each
-    yield _table(["environment, robot steps/s", *heads], rows, used)
+    """Yields the tables of docs/benchmarks.md, then those of docs/performance.md."""
+    card = {"device": CARD}
+    yield _by_size("environment, robot steps/s", lines, ENVIRONMENTS, ARENAS, card)
     yield _of_trainers(lines)
-    chosen = {name: find(lines, device=CORES, **where)[-1] for name, where in ON_CORES.items()}
-    rows = [[name, f"{line['transitions_per_s']:,.0f}"] for name, line in chosen.items()]
-    yield _table(["training on two cores", "transitions/s"], rows, list(chosen.values()))
+    yield _by_size(
+        "training on two cores, transitions/s", lines, ON_CORES, ARENAS_ON_CORES, {"device": CORES}
+    )
+    training = {body: {"benchmark": TRAINING, "robot": body} for body in ("planar", "wheeled")}
+    yield _by_size("training, transitions/s", lines, training, ARENAS, card)
+    yield _of_physics(lines)
+
+
+def _by_size(
+    head: str,
+    lines: list[Line],
+    rows: dict[str, dict[str, Any]],
+    sizes: tuple[int, ...],
+    where: dict[str, Any],
+) -> str:
+    """Makes a table of speeds with a column for each number of arenas."""
+    found = {
+        name: [find(lines, arenas=arenas, **where, **row)[-1] for arenas in sizes]
+        for name, row in rows.items()
+    }
+    cells = [[name, *map(_speed, each)] for name, each in found.items()]
+    heads = [head, *(f"{arenas:,} arenas" for arenas in sizes)]
+    return _table(heads, cells, [line for each in found.values() for line in each])
 
 
 def _of_trainers(lines: list[Line]) -> str:
-    heads = [
-        "training, 8,192 arenas, 5 seeds",
-        "arena steps/s",
-        "s to 90 %",
-        "s to 95 % of targets",
-    ]
+    heads = ["training, 5 seeds", "arena steps/s", "s to 90 %", "s to 95 % of targets"]
     rows, used = [], []
     for name, trainer in TRAINERS.items():
-        seeds = find(lines, device=CARD, benchmark="race", trainer=trainer, arenas=8192)
-        speed = _millions(statistics.median(line["arena_steps_per_s"] for line in seeds))
+        seeds = find(lines, device=CARD, benchmark="race", trainer=trainer)
+        speed = _short(statistics.median(line["arena_steps_per_s"] for line in seeds))
         rows.append([name, speed, _seconds(seeds, "0.90"), _seconds(seeds, "0.95")])
         used += seeds
+    return _table(heads, rows, used)
+
+
+def _of_physics(lines: list[Line]) -> str:
+    heads = ["`robot`, `sim.solver`, stepped by", "H200, 65,536 arenas", "two cores, 128 arenas"]
+    rows, used = [], []
+    for (robot, solver), by in STEPPED_BY.items():
+        where = {"benchmark": ENVIRONMENT, "robot": robot, "solver": solver}
+        card = find(lines, device=CARD, arenas=65536, **where)[-1]
+        cores = find(lines, device=CORES, arenas=128, **where)[-1]
+        rows.append([f"`{robot}`, `{solver}`: {by}", _speed(card), _speed(cores)])
+        used += [card, cores]
     return _table(heads, rows, used)
 
 
@@ -97,17 +125,36 @@ def _seconds(seeds: list[Line], share: str) -> str:
     return text + f"; {never} never" * (never > 0)
 
 
-def _millions(value: float) -> str:
-    return f"{value / 1e6:.{0 if value >= 1e8 else 1}f} M"
+def _speed(line: Line) -> str:
+    """Returns the transitions or robot steps per second, with their range if it is wide."""
+    median, calls_s = line["transitions_per_s"] or line["robot_steps_per_s"], line["calls_s"]
+    slowest, fastest = (median * line["call_s"] / end(calls_s) for end in (max, min))
+    if fastest - slowest < 0.1 * median:
+        return _short(median)
+    size = _unit(median)[1]
+    return f"{_short(median)} ({_digits(slowest / size)} to {_digits(fastest / size)})"
+
+
+def _short(value: float) -> str:
+    unit, size = _unit(value)
+    return f"{_digits(value / size)} {unit}"
+
+
+def _unit(value: float) -> tuple[str, float]:
+    return ("M", 1e6) if value >= 1e6 else ("k", 1e3)
+
+
+def _digits(value: float) -> str:
+    return f"{value:.{0 if value >= 100 else 1}f}"
 
 
 def _table(heads: list[str], rows: list[list[str]], used: list[Line]) -> str:
-    """Lays out a table, and names the commits and the device."""
+    """Lays out a table, and names the commit and the devices."""
     commits, devices = {line["commit"][:7] for line in used}, {line["device"] for line in used}
-    assert len(commits) == len(devices) == 1
+    assert len(commits) == 1
     body = [heads, ["---", *["--:"] * (len(heads) - 1)], *rows]
     text = "\n".join(f"| {' | '.join(row)} |" for row in body)
-    return f"{text}\n\n{devices.pop()}; commit {commits.pop()}.\n"
+    return f"{text}\n\n{' and '.join(sorted(devices))}; commit {commits.pop()}.\n"
 
 
 if __name__ == "__main__":

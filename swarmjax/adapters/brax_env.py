@@ -34,8 +34,9 @@ class SwarmBraxEnv(_base.Env):
 
     A robot that has arrived waits for the others, and nothing must be learned from its transitions
     while it waits. Brax cannot mask transitions, so this class marks these transitions as
-    truncated. Marked transitions stay in Brax's batch, but with zero advantage and zero value
-    error. Absent robots have no Brax environment.
+    truncated. Marked transitions stay in Brax's batch without value error, and with the advantage
+    0. Brax then normalises advantages, which makes this one the negative mean of the batch, in
+    units of its standard deviation. Absent robots have no Brax environment.
     """
 
     def __init__(self, swarm: Swarm) -> None:
