@@ -43,6 +43,7 @@ from benchmarks.peers import PeerConfig
 from swarmjax import environment
 from swarmjax.config import Section, about, to_dict
 from swarmjax.ppo import optimizer
+from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
 
@@ -52,6 +53,7 @@ ACTION_SIZE = 2
 LEARNING_RATE, DISCOUNT, GAE_LAMBDA, CLIP = 1e-3, 0.99, 0.95, 0.2
 ENTROPY_COST, VALUE_COST, MAX_GRAD_NORM = 2e-6, 4.5, 0.5
 
+_OURS = AlgoConfig()
 Pool = tuple[Any, Any]
 
 
@@ -59,9 +61,13 @@ Pool = tuple[Any, Any]
 class TrainerConfig(PeerConfig):
     """Settings for measuring a trainer; `steps` is not used."""
 
-    rollout: int = field(default=32, metadata=about("control steps per update", 1, 10**4))
-    epochs: int = field(default=4, metadata=about("passes over a rollout", 1, 100))
-    minibatches: int = field(default=8, metadata=about("gradient steps per pass", 1, 1000))
+    rollout: int = field(
+        default=_OURS.rollout_length, metadata=about("control steps per update", 1, 10**4)
+    )
+    epochs: int = field(default=_OURS.epochs, metadata=about("passes over a rollout", 1, 100))
+    minibatches: int = field(
+        default=_OURS.num_minibatches, metadata=about("gradient steps per pass", 1, 1000)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,19 +1,24 @@
 """With which PPO does the same swarm learn to reach its targets sooner, swarmjax's or Brax's?
 
 `python -m benchmarks.race trainer=swarmjax|brax [seed=0,1,2] [points=30] [key=value ...]` takes the
-keys of `swarmjax.train` and prints a JSON line for each seed. Both trainers use the same compiled
-environment, with the same networks, batch, minibatches, epochs, discount, clip range, costs and
-gradient clipping. They also initialise weights in the same way.
+keys of `swarmjax.train` and prints a JSON line for each seed. Both trainers use the same physics,
+task and distribution of levels, and the same networks, batch, minibatches, epochs, discount, clip
+range, costs and gradient clipping. They also initialise weights in the same way.
 The policies of both are evaluated with their mean actions on the same levels, at `points` points
 evenly spaced over the budget.
 
 Brax differs in these points:
 
+- it steps the environment through the adapter `SwarmBraxEnv`;
 - one constant learning rate for actor and critic, our actor's with `settings=ours`;
 - Adam's epsilon;
 - minibatches of robots instead of arenas or tiles of samples;
 - no bound on normalised observations;
 - no loss that keeps mean actions within the range of commands;
+- values and advantages are computed and normalised again in each minibatch;
+- the advantage discounts the next step's return fully (`brax/training/agents/ppo/losses.py`,
+  `compute_gae`), where that of the GAE paper (equation 16) has a factor lambda;
+- steps at the time limit have no advantage, where ours are bootstrapped;
 - no mask, so robots that have arrived stay in its batch (docs/adapters.md).
 
 Brax gets our option for XLA (`program.compiler_options`) only through the environment variable
@@ -86,6 +91,7 @@ BRAX = {
     "bounded": "Brax PPO, our settings and its bounded actions",
     "playground": "Brax PPO, Playground's settings",
 }
+BRAX_RESETS = "at once, each on a level drawn after a sixteenth of the arenas has ended an episode"
 ACTION_SIZE = 2
 _COMPILING = 2  # Brax may compile in this many first calls; the second takes the first's results
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
@@ -358,6 +364,7 @@ def line(race: RaceConfig, trained: TrainConfig, course: Course) -> dict[str, An
         "trainer": "swarmjax" if ours else BRAX[race.settings],
         "seed": trained.seed,
         **steps_per_second.about(trained),
+        **({} if ours else {"resets": BRAX_RESETS}),
         "arena_steps_per_s": float(np.median(np.diff(course.arena_steps) / calls_s)),
         "transitions_per_s": float(speed),
         "compile_s": course.compile_s,

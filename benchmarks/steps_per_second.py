@@ -252,7 +252,9 @@ def time_environment(prepared: Prepared, arenas: rollout.Arena) -> dict[str, Any
 
 
 def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any]:
-    """Times training; the environment's speed determines the number of updates per call.
+    """Times training over at least an episode, since steps become slower within an episode.
+
+    The environment's speed determines the number of updates per call.
 
     Args:
       prepared: the compiled programs of one size.
@@ -265,8 +267,10 @@ def time_training(prepared: Prepared, arena_steps_per_s: float) -> dict[str, Any
     per_update = settings.seeds * settings.arenas * settings.algo.rollout_length
     updates = TRAIN_SECONDS * arena_steps_per_s / per_update / 2
     n = int(np.clip(updates, 1, prepared.program.rows))
+    episode = -(-settings.task.step_limit // (n * settings.algo.rollout_length))
+    repeats = max(timing.REPEATS, episode)
     state = prepared.start(prepared.schedule)
-    calls_s, metrics = timing.time_program(prepared.training, state, np.int32(n))
+    calls_s, metrics = timing.time_program(prepared.training, state, np.int32(n), repeats)
     transitions = float(np.sum(np.asarray(metrics["transitions"], np.float64)[:, :n]))
     return _line(prepared, "training", n * settings.algo.rollout_length, calls_s, transitions)
 

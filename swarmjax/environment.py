@@ -152,16 +152,23 @@ class Swarm:
           The new state, and the outcome of the step: observation [A, R, O], reward, terminated,
           truncated and valid [A, R], done and sound [A].
         """
-        unpack = partial(physics.unpack, self.world.physics)
-        arenas = replace(state.arenas, sim=jax.vmap(unpack)(state.arenas.sim))
-        arenas, came = jax.vmap(partial(env.step, self.world))(arenas, action)
-        arenas = rollout.restart(arenas, state.waiting, came.done)
-        arenas = replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
+        arenas, came = self._advance(state.arenas, action)
+        arenas = _pack(rollout.restart(arenas, state.waiting, came.done))
         played = state.played | came.done
         next_up = state.waiting, played, state.key
         enough = jnp.mean(played) >= _PLAYED
         next_up = jax.lax.cond(enough, self._redraw, lambda *same: same, *next_up)
         return SwarmState(arenas, *next_up), came
+
+    def step_without_reset(self, state: SwarmState, action: Array) -> tuple[SwarmState, TimeStep]:
+        """Advances all arenas as `step` does, but starts no new episodes and draws no levels."""
+        arenas, came = self._advance(state.arenas, action)
+        return replace(state, arenas=_pack(arenas)), came
+
+    def _advance(self, arenas: EnvState, action: Array) -> tuple[EnvState, TimeStep]:
+        unpack = partial(physics.unpack, self.world.physics)
+        arenas = replace(arenas, sim=jax.vmap(unpack)(arenas.sim))
+        return jax.vmap(partial(env.step, self.world))(arenas, action)
 
     def _redraw(
         self, waiting: EnvState, played: Array, key: Array
@@ -182,6 +189,10 @@ class Swarm:
 
         uniforms = jax.random.uniform(key, (len(arena), level.uniform_count(spacing)))
         return jax.vmap(start)(uniforms, arena)
+
+
+def _pack(arenas: EnvState) -> EnvState:
+    return replace(arenas, sim=jax.vmap(physics.pack)(arenas.sim))
 
 
 def load(config: ProgramConfig) -> Swarm:

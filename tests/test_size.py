@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 _BLANK = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
 CEILINGS = {
     "code lines of swarmjax": 19_210,
-    "code lines of benchmarks": 4_500,
+    "code lines of benchmarks": 4_360,
     "keys of train": 141,
     "longest file": 450,
     "longest function": 60,

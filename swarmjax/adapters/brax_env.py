@@ -36,7 +36,8 @@ class SwarmBraxEnv(_base.Env):
     while it waits. Brax cannot mask transitions, so this class marks these transitions as
     truncated. Marked transitions stay in Brax's batch without value error, and with the advantage
     0. Brax then normalises advantages, which makes this one the negative mean of the batch, in
-    units of its standard deviation. Absent robots have no Brax environment.
+    units of its standard deviation. Marked transitions also stay in Brax's statistics of
+    observations and in its entropy bonus. Absent robots have no Brax environment.
     """
 
     def __init__(self, swarm: Swarm) -> None:

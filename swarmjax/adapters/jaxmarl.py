@@ -75,24 +75,25 @@ class SwarmMultiAgentEnv(_base):
         Raises:
           ValueError: if an action is missing, or has a wrong shape or dtype.
         """
-        _, state, rewards, dones, info = self.step_env(key, state, actions)
-        if reset_state is not None:
-            again = partial(jnp.where, dones["__all__"])
-            state = jax.tree.map(again, reset_state, state)
-        return self.get_obs(state), state, rewards, dones, info
+        given = reset_state is not None
+        state, came = self.robots.step(state, self._stack(actions), resets=not given)
+        if given:
+            state = jax.tree.map(partial(jnp.where, came.over[0]), reset_state, state)
+        return self.get_obs(state), state, *self._outcome(came)
 
     def step_env(
         self, key: Array, state: SwarmState, actions: _ByAgent
     ) -> tuple[_ByAgent, SwarmState, _ByAgent, _ByAgent, _ByAgent]:
-        """Makes a step as `step` does.
+        """Makes a step as `step` does, but does not start the next episode."""
+        state, came = self.robots.step(state, self._stack(actions), resets=False)
+        return self.get_obs(state), state, *self._outcome(came)
 
-        If the step ends the episode, the returned observation is the episode's last one.
-        """
-        state, came = self.robots.step(state, self._stack(actions))
+    def _outcome(self, came: RobotStep) -> tuple[_ByAgent, _ByAgent, _ByAgent]:
+        """Returns the rewards and the dones by agent, and the info."""
         names = ("valid", "terminated", "truncated", "is_success")
         info = {name: getattr(came, name) for name in names}
         dones = self._by_agent(_is_done(came)) | {"__all__": came.over[0]}
-        return self._by_agent(came.last), state, self._by_agent(came.reward), dones, info
+        return self._by_agent(came.reward), dones, info
 
     def get_obs(self, state: SwarmState) -> _ByAgent:
         """Returns the [O] observations by agent."""

@@ -70,19 +70,23 @@ class RobotRow:
         """Returns the [N, O] observations to act on."""
         return self._gather(state.observation)
 
-    def step(self, state: SwarmState, action: Array) -> tuple[SwarmState, RobotStep]:
+    def step(
+        self, state: SwarmState, action: Array, *, resets: bool = True
+    ) -> tuple[SwarmState, RobotStep]:
         """Steps all arenas once. An arena whose episode ends starts its next episode.
 
         Args:
           state: the state before the step.
           action: [N, U] actions, clipped to -1..1; -1 and 1 are the ends of the range of commands.
+          resets: whether episodes that end are followed by the next ones.
 
         Returns:
           The state after the step, and the outcome for each robot.
         """
         arenas, robots = self.swarm.num_arenas, self.swarm.num_robots
         places = jnp.zeros((arenas * robots, self.action_size)).at[self.index].set(action)
-        state, came = self.swarm.step(state, places.reshape(arenas, robots, -1))
+        move = self.swarm.step if resets else self.swarm.step_without_reset
+        state, came = move(state, places.reshape(arenas, robots, -1))
         return state, RobotStep(
             observation=self.observe(state),
             last=self._gather(came.observation),

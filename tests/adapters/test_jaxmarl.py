@@ -85,16 +85,18 @@ def test_who_has_arrived_has_no_actions(env: SwarmMultiAgentEnv, steps: list) ->
 
 
 @pytest.mark.slow
-def test_step_env_sees_the_last_of_the_episode(
+def test_step_env_stays_in_the_episode(
     env: SwarmMultiAgentEnv, steps: list, arena_course: Course
 ) -> None:
     before = jax.tree.map(lambda x: x[0], steps[LIMIT - 2][1])
     told = arena_course.action[LIMIT - 1, 0]
-    seen, *_ = jax.jit(env.step_env)(
+    seen, after, *_ = jax.jit(env.step_env)(
         jax.random.key(0), before, dict(zip(AGENTS, told, strict=True))
     )
     last = arena_course.came.observation[LIMIT - 1, 0]
     assert_close(seen["agent_1"], last[1])
+    assert_close(after.observation[0, 1], last[1])
+    assert int(after.arenas.clock[0]) == LIMIT
 
 
 @pytest.mark.slow
