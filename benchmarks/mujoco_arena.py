@@ -16,11 +16,10 @@ from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.evaluate.engine_c import Arenas
 from swarmjax.evaluate.judge import Judge
 from swarmjax.policy import Policy
+from swarmjax.sim.drive import ACTION_SIZE
 from swarmjax.task import observation
 from swarmjax.task.config import resolve_encoding
 from swarmjax.task.stage_files import load_levels
-
-ACTION_SIZE = 2
 
 
 class Moved(NamedTuple):

@@ -26,6 +26,7 @@ from swarmjax.config import Section, about, to_dict
 from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.ppo.config import AlgoConfig
 from swarmjax.run.load_settings import load_train
+from swarmjax.sim import drive
 from swarmjax.task import observation
 
 _WARM = 200  # control steps of the warm-up cycle of `paper_way`
@@ -61,15 +62,13 @@ class Robot:
     def __init__(self, torch: Any, algo: AlgoConfig) -> None:
         """Makes both networks with PyTorch's default initialisation."""
         self._torch, self._algo = torch, algo
-        self._actor = _network(
-            torch, algo.hidden_sizes, mujoco_arena.ACTION_SIZE, last=torch.nn.Tanh()
-        )
+        self._actor = _network(torch, algo.hidden_sizes, drive.ACTION_SIZE, last=torch.nn.Tanh())
         self._critic = _network(torch, algo.hidden_sizes, 1)
         rates = ((self._actor, algo.actor_learning_rate), (self._critic, algo.critic_learning_rate))
         self._optimizer = torch.optim.Adam(
             [{"params": net.parameters(), "lr": rate} for net, rate in rates]
         )
-        self._variance = torch.full((mujoco_arena.ACTION_SIZE,), algo.initial_std**2)
+        self._variance = torch.full((drive.ACTION_SIZE,), algo.initial_std**2)
         self.forget()
 
     def forget(self) -> None:
@@ -167,7 +166,7 @@ def _control_step(
     arena: MujocoArena, robots: Sequence[Robot], drives: Sequence[Robot], seen: np.ndarray
 ) -> tuple[Moved, list[Robot]]:
     """Takes one control step; returns its results and the robots that have not yet arrived."""
-    none = np.zeros(mujoco_arena.ACTION_SIZE, np.float32)
+    none = np.zeros(drive.ACTION_SIZE, np.float32)
     ask = zip(robots, seen, strict=True)
     action = np.stack([robot.act(each) if robot in drives else none for robot, each in ask])
     moved = arena.step(action)

@@ -430,17 +430,15 @@ def sb3(words: Sequence[str]) -> Iterator[Line]:
         robots = adapter.SwarmVecEnv(environment.load(trained))
         chosen = sb3_settings(trained, robots.num_envs)
         model = library.PPO("MlpPolicy", robots, device="cpu", **chosen)
-        calls_s = []
-        for call in range(1 + config.repeats):
-            began = time.perf_counter()
-            model.learn(robots.num_envs * chosen["n_steps"], reset_num_timesteps=call == 0)
-            calls_s.append(time.perf_counter() - began)
-        rate = chosen["n_steps"] * arenas / timing.spread(calls_s[1:])["call_s"]
+        batch = robots.num_envs * chosen["n_steps"]
+        learn = partial(model.learn, batch, reset_num_timesteps=False)
+        calls_s = timing.time_calls(learn, config.repeats)
+        rate = chosen["n_steps"] * arenas / timing.spread(calls_s)["call_s"]
         yield {
             "benchmark": "peer_sb3",
             "trainer": "Stable-Baselines3 PPO, swarmjax's environment",
             "robot": trained.robot.body,
-            **peers.training(trained.stage[-1].robots, arenas, rate, calls_s[1:]),
+            **peers.training(trained.stage[-1].robots, arenas, rate, calls_s),
             "settings": to_dict(config) | {"ppo": chosen},
             **peers.with_torch(torch, "cpu", "stable-baselines3", "gymnasium"),
         }

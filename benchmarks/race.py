@@ -51,17 +51,16 @@ from benchmarks import lines, peers, steps_per_second, timing
 from swarmjax import environment
 from swarmjax.config import ConfigError, Section, about, to_dict
 from swarmjax.config.section import MAX_COUNT
-from swarmjax.evaluate import engine_mjx
-from swarmjax.evaluate import judge as levels_judge
+from swarmjax.evaluate import cells, engine_mjx
+from swarmjax.evaluate.config import EvaluateConfig
 from swarmjax.ppo import optimizer
-from swarmjax.ppo.ppo import LearnerState
+from swarmjax.ppo.ppo import PPO, LearnerState
 from swarmjax.run.compiled import compile_chunk
 from swarmjax.run.load_settings import load_train
 from swarmjax.run.settings import TrainConfig
-from swarmjax.task import stage as task_stage
+from swarmjax.sim import drive
 from swarmjax.task import world as task_world
 from swarmjax.task.level import Level
-from swarmjax.task.world import World
 from swarmjax.training import mesh
 from swarmjax.training import program as programs
 
@@ -92,7 +91,6 @@ BRAX = {
     "playground": "Brax PPO, Playground's settings",
 }
 BRAX_RESETS = "at once, each on a level drawn after a sixteenth of the arenas has ended an episode"
-ACTION_SIZE = 2
 _COMPILING = 2  # Brax may compile in this many first calls; the second takes the first's results
 _ACTIVATIONS = {"tanh": linen.tanh, "relu": linen.relu, "swish": linen.swish}
 
@@ -141,13 +139,14 @@ Act = Callable[[Any, jax.Array], jax.Array]
 
 def load_judge(race: RaceConfig, trained: TrainConfig, act: Act) -> Judge:
     """Makes a judge, which maps the parameters of a policy to the share of targets reached."""
-    world = _world(trained, race.levels)
-    one, draw = task_stage.single(trained.stage[-1], world.drawings), levels_judge.draw_level
-    drawn = (
-        draw(one, world.spacing, race.level_seed, episode, world.drawings)
-        for episode in range(race.levels)
+    *_, stage = trained.stage
+    sim = replace(trained.sim, max_robots=stage.robots, max_obstacles=stage.obstacles)
+    parts = trained.robot, trained.task, trained.realism, sim
+    world = task_world.load((stage,), *parts, arenas=race.levels)
+    judged = EvaluateConfig(
+        policy="none", stage=stage, robot=trained.robot, task=trained.task, seed=race.level_seed
     )
-    levels = Level(*map(np.stack, zip(*drawn, strict=True)))
+    levels = cells.draw_stage(judged, range(race.levels)).levels
 
     @jax.jit
     def share(params: Any, levels: Level) -> jax.Array:
@@ -160,23 +159,10 @@ def load_judge(race: RaceConfig, trained: TrainConfig, act: Act) -> Judge:
     return lambda params: float(share(params, levels))
 
 
-def _world(trained: TrainConfig, arenas: int) -> World:
-    """Compiles the environment for so many arenas, with no room for absent obstacles."""
-    *_, stage = trained.stage
-    sim = replace(trained.sim, max_robots=stage.robots, max_obstacles=stage.obstacles)
-    parts = trained.robot, trained.task, trained.realism, sim
-    return task_world.load((stage,), *parts, arenas=arenas)
-
-
-def act_ours(trained: TrainConfig) -> Act:
-    """Makes the function that acts for learners [N=1, L=1] of our trainer."""
-    ppo = programs.load_ppo(trained, _world(trained, 1))
-
-    def act(learners: LearnerState, seen: jax.Array) -> jax.Array:
-        still = jnp.zeros((*seen.shape[:-1], ACTION_SIZE))
-        return ppo.act(jax.tree.map(lambda x: x[0, 0], learners), seen, still)[0]
-
-    return act
+def act_ours(ppo: PPO, learners: LearnerState, seen: jax.Array) -> jax.Array:
+    """Returns the mean actions of our learners [N=1, L=1], as an `Act` with `ppo` bound."""
+    still = jnp.zeros((*seen.shape[:-1], ppo.sizes.action))
+    return ppo.act(jax.tree.map(lambda x: x[0, 0], learners), seen, still)[0]
 
 
 def points(race: RaceConfig, trained: TrainConfig) -> np.ndarray:
@@ -194,7 +180,10 @@ def run_ours(race: RaceConfig, trained: TrainConfig) -> Course:
     program, schedule = programs.load(trained)
     state = jax.jit(mesh.init(program))(schedule)
     compiled = compile_chunk(program, schedule, state)
-    judge, updates = load_judge(race, trained, act_ours(trained)), points(race, trained)
+    judge, updates = (
+        load_judge(race, trained, partial(act_ours, program.ppo)),
+        points(race, trained),
+    )
     judge(jax.device_get(state.learners))  # compiles, and lets Warp build its kernels
     seconds, shares, transitions = [], [], []
     for n in np.diff(updates, prepend=0):
@@ -279,9 +268,9 @@ def network_factory(race: RaceConfig, trained: TrainConfig) -> Callable[..., Any
         distribution_type="tanh_normal" if bounded else "normal",
         noise_std_type="log",
         init_noise_std=algo.initial_std,
-        policy_network_kernel_init_fn=lambda: partial(_kernel, (1 + bounded) * ACTION_SIZE),
+        policy_network_kernel_init_fn=lambda: partial(_kernel, (1 + bounded) * drive.ACTION_SIZE),
         value_network_kernel_init_fn=lambda: partial(_kernel, 1),
-        mean_kernel_init_fn=lambda: partial(_kernel, ACTION_SIZE),
+        mean_kernel_init_fn=lambda: partial(_kernel, drive.ACTION_SIZE),
     )
 
 
@@ -291,14 +280,13 @@ def _kernel(outputs: int, key: jax.Array, shape: tuple[int, ...], dtype: Any = N
     return jax.nn.initializers.orthogonal(gain)(key, shape, dtype)
 
 
-def act_brax(race: RaceConfig, trained: TrainConfig) -> Act:
+def act_brax(race: RaceConfig, trained: TrainConfig, observation_size: int) -> Act:
     """Makes the function that acts for the parameters that Brax trained."""
     networks = peers.find("brax.training.agents.ppo.networks", "the extra brax")
     statistics = peers.find("brax.training.acme.running_statistics", "the extra brax")
     wide = trained.algo.normalize_observations
     normal = {"preprocess_observations_fn": statistics.normalize} if wide else {}
-    sizes = programs.load_ppo(trained, _world(trained, 1)).sizes
-    made = network_factory(race, trained)(sizes.observation, sizes.action, **normal)
+    made = network_factory(race, trained)(observation_size, drive.ACTION_SIZE, **normal)
     choose, key = networks.make_inference_fn(made), jax.random.key(0)
     return lambda params, seen: choose(params, deterministic=True)(seen, key)[0]
 
@@ -307,7 +295,8 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
     """Trains with Brax's PPO; raises MissingPeerError if Brax is not installed."""
     brax_ppo = peers.find("brax.training.agents.ppo.train", "the extra brax")
     adapter = peers.find("swarmjax.adapters.brax_env", "the extra brax")
-    judge = load_judge(race, trained, act_brax(race, trained))
+    swarm = adapter.SwarmBraxEnv(environment.load(trained))
+    judge = load_judge(race, trained, act_brax(race, trained, swarm.observation_size))
     given = brax_settings(race, trained)
     shares: list[float] = []
     seconds: list[float] = []
@@ -318,7 +307,7 @@ def run_brax(race: RaceConfig, trained: TrainConfig) -> Course:
 
     with adapter.mended_jax():
         brax_ppo.train(
-            environment=adapter.SwarmBraxEnv(environment.load(trained)),
+            environment=swarm,
             wrap_env=False,
             max_devices_per_host=1,
             run_evals=False,

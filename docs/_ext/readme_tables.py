@@ -49,15 +49,18 @@ STEPPED_BY = {
 }
 
 
+DEFAULTS = {"robot": "planar", "solver": "auto"}  # also of peers' lines, which lack these entries
+
+
 def read() -> list[Line]:
-    """Reads the lines, newest last; peers count as planar."""
+    """Reads the lines, newest last."""
     lines = [json.loads(line) for line in RESULTS.read_text().splitlines()]
-    return [{"robot": "planar", "solver": "auto"} | line for line in lines]
+    return [DEFAULTS | line for line in lines]
 
 
 def find(lines: list[Line], **where: Any) -> list[Line]:
     """Returns the lines with these entries that are of the newest commit among them."""
-    where = {"robot": "planar", "solver": "auto"} | where
+    where = DEFAULTS | where
     found = [line for line in lines if all(line.get(k) == v for k, v in where.items())]
     return [line for line in found if line["commit"] == found[-1]["commit"]]
 

@@ -102,7 +102,7 @@ def test_the_judge_takes_the_mean_action_of_the_policy(
 ) -> None:
     chosen = RaceConfig(settings=settings)
     moments, policy, critic = _begin_brax(chosen, tiny_config)
-    found = race.act_brax(chosen, tiny_config)((moments, policy, critic), jnp.asarray(SEEN))
+    found = race.act_brax(chosen, tiny_config, SIZE)((moments, policy, critic), jnp.asarray(SEEN))
     layers = policy["params"]
     torso = dict(layers["MLP_0"] if settings == "ours" else layers)
     head = layers["Dense_0"] if settings == "ours" else torso.pop(f"hidden_{len(torso) - 1}")
